@@ -25,8 +25,8 @@ class CommandLimits:
         speed: of each gripper at most [m/s].
         turn_rate: of each gripper at most [rad/s].
         min_distance: of the grippers from each other at least, in lengths of the cable.
-        max_distance: of the grippers from each other at most, in lengths of the cable: below 1, or it is pulled taut.
-            Where the grippers are turned away from each other the cable reaches less far, and the limit is lower.
+        max_distance: of the grippers from each other at most, in lengths of the cable; at 1 the cable would be taut. If
+            the grippers are turned away from each other, the cable reaches less far, and the limit is lower.
         workspace: lowest and highest corner (x, y) of where the grippers may be [m]; None = anywhere.
     """
 

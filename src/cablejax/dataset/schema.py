@@ -69,7 +69,7 @@ class DatasetConfig:
         randomisation: ranges of the physical parameters.
         engine: "chain", batched in JAX, the fastest, which can simulate every effect; "mjx", batched too; or
             "threaded", C MuJoCo in threads on the CPU.
-        shard_size: trajectories per shard: the unit that one process writes and that a kill can cost.
+        shard_size: trajectories per shard, the unit that one process writes and that a kill can lose.
         effects: added to every cable after its parameters are drawn, in this order.
         posterior: sets of effects, equally probable; after `effects`, trajectory i gets the one of number i modulo
             their number. See `cablejax.effects.verdicts.posterior_of_verdict`.

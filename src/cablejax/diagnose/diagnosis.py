@@ -156,12 +156,12 @@ class NextMotion:
     Attributes:
         motion: "designed", or its name among `cablejax.diagnose.safe_motions`.
         separates: the explanations that the log leaves open, most probable first; empty if there is one only.
-        information: lower bound of what its recording is expected to tell about which of them holds [nats]; of a single
-            one, about its parameters.
-        doubt: entropy of their probabilities, which no motion can exceed [nats]; 0 for a single one.
+        information: lower bound on the expected information of its recording about which of them holds [nats]; of a
+            single one, about its parameters.
+        doubt: entropy of their probabilities, an upper bound on the information [nats]; 0 for a single one.
         alternatives: the information of every motion of the library that keeps all bounds, and of the designed one.
         poses: of the grippers (x, y, theta) [m, rad], shape [T, 2, 3].
-        interval: between two of them [s].
+        interval: time between two poses [s].
         shapes: keypoints as each explanation predicts them for that motion [m], shape [T, N, 2] each.
         ended: of the design's search: "clear" (next to no doubt would be left), "settled" (no better motion came) or
             "budget" (of simulations); None where nothing was designed.
@@ -210,31 +210,31 @@ class NextMotion:
 class Diagnosis:
     """Diagnosis of any simulator: the effect it lacks on a recording, and how far the gap shrinks with it.
 
-    What a simulator does not compute is None.
+    Fields that a simulator does not compute are None.
 
     Attributes:
         verdict: see the format.
         sentence: the verdict in words.
-        effects: what is named as the cause; empty for "none" and "unknown".
+        effects: effects named as the cause; empty for "none" and "unknown".
         equivalent: sets of effects that are indistinguishable on this log.
         ranking: every effect tried, most probable first; of a forward search, every trial in order.
-        leftover_p: chance that a right explanation leaves as much as the best one does, see `belief.leftover_p`; None
-            without a gap, and where no labelled logs are like this one.
+        leftover_p: chance that a right explanation leaves as much error as the best one, see `belief.leftover_p`; None
+            without a gap, or without labelled logs like this one.
         gap: before and after.
         where: along the cable, in time, by regime, by frame; None where no adapter localises.
-        next_motion: None if nothing would be gained, or no motion was evaluated.
+        next_motion: recommended motion; None if nothing would be gained, or no motion was evaluated.
         baselines: the single effect that simpler rules would have named: "lowest_cost" (best fit in sample), "bic" (the
             same with Schwarz's penalty, all samples taken to be independent) and "sparse_regression" (the best template
             without any fit); empty for the verdict "none".
-        caveats: what the log did not allow, in words.
+        caveats: limits of the verdict, in words.
         seconds: run time.
         settings: versions and options, for the record.
         posterior: sets of effects, equally probable: draws of which explanation holds and of its parameters; empty
             where nothing is named.
-        quantities: what the log shows of the system, whether an effect is named for it or not; empty where the adapter
-            has none.
-        under_laws: what the verdict would be under other laws of the simulator; `effects` and `posterior` have their
-            intervals over all laws. Empty without a gap, and where the simulator offers none.
+        quantities: quantities of the system that the log identifies, whether or not an effect is named; empty if the
+            adapter has none.
+        under_laws: the verdict under other laws of the simulator; intervals of `effects` and `posterior` cover all
+            laws. Empty without a gap, or if the simulator offers none.
     """
 
     verdict: Verdict

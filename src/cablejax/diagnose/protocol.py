@@ -154,10 +154,9 @@ class Plan:
     Attributes:
         first_steps, last_steps, grown_steps: Gauss-Newton steps of every single effect, of the best ones, and of sets
             of effects.
-        tolerance: a fit is done once a step promises to lower its cost by less than this [nats].
-        parts: recordings are dealt out to so many parts at most, and every explanation is fitted without each part in
-            turn; None = leaving out a motion is pictured by one linear step, which suits many episodes without anything
-            of their own.
+        tolerance: a fit ends once a step is predicted to lower its cost by less than this [nats].
+        parts: most parts into which recordings are divided; every explanation is refitted without each part. None = one
+            linear step approximates leaving out a motion, which suits many episodes without parameters of their own.
     """
 
     first_steps: int = 3
@@ -170,19 +169,19 @@ class Plan:
 class Simulator(abc.ABC):
     """A simulator of one recording, as a diagnosis sees it.
 
-    The simulator keeps all that was recorded apart from the observations: commands, measured poses, first states.
+    The simulator holds everything recorded except the observations: commands, measured poses, first states.
 
     Attributes:
-        effects: that may be at work, each with a name of its own.
+        effects: possible effects, with distinct names.
         unit: of the observations; all have the same.
         right_scores: scores of right explanations on labelled recordings like this one, see `belief.leftover_p`; empty
-            where nobody has made any, and then no p-value is computed.
-        beside_unknown: share of the effects named beside an unknown cause that are causes, on labelled recordings;
-            None where nobody has made any, and then such names have no probability.
+            if there are none, and then no p-value is computed.
+        beside_unknown: share of the effects named alongside an unknown cause that are causes, on labelled recordings;
+            None if there are none, and then such names have no probability.
         plan: of the search and of the fits.
-        recording: of every episode, counted from 0; only needed where a recording has numbers of its own.
-        fits_unseen: whether what a recording has for its own is fitted even to one that is held out: a nuisance that
-            says nothing of the cause. Otherwise it is 0 there.
+        recording: recording of every episode, counted from 0; only needed if single recordings have parameters.
+        fits_unseen: whether a held-out recording's own parameters are fitted to it, as nuisances that say nothing about
+            the cause. Otherwise they are 0 there.
     """
 
     effects: Sequence[Effect]

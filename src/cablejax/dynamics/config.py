@@ -59,7 +59,7 @@ class ModelConfig:
         symmetric: whether the graph network's weights are tied so that mirrored or reversed cables move alike, see
             `cablejax.dynamics.symmetry`.
         normalisation: scales of features and output.
-        statics: what the static prior knows of the cable beyond its length.
+        statics: parameters of the static prior beyond the cable's length.
     """
 
     n_keypoints: int = 13

@@ -49,17 +49,17 @@ class TrainConfig:
     Attributes:
         model: sizes of the network; its normalisation is replaced by one measured on the training data.
         phases: one after the other; optimiser state and averaged weights carry over.
-        flips: whether windows are mirrored and reversed at random: as likely as the originals for a uniform straight
-            cable, and not for one with an effect at some place or on some side.
+        flips: whether windows are mirrored and reversed at random. For a uniform straight cable these are as likely as
+            the originals; for a cable with an effect at one place or on one side they are not.
         seed: of initial weights, windows, augmentation and noise.
         warmup: optimiser steps over which the learning rate rises from 0.
         weight_decay: of AdamW.
         clip: largest global gradient norm.
-        ema: decay of the weights' moving average, which is what is evaluated and kept.
+        ema: decay of the moving average of the weights, which is evaluated and saved.
         chunk: optimiser steps per compiled call.
         checkpoint_every: chunks between checkpoints.
         evaluate_every: chunks between open-loop evaluations.
-        evaluate_starts: at most so many start points per evaluation.
+        evaluate_starts: most start points per evaluation.
     """
 
     model: ModelConfig = ModelConfig()

@@ -67,9 +67,9 @@ class Parameter:
 class Effect:
     """Something that a real system does and its nominal simulator does not.
 
-    How an effect acts is the simulator's business; a diagnosis needs what is stated here. An effect of a simulator of
-    your own is an instance of this class, see `cablejax.diagnose.Simulator`; effects of a cable are subclasses that say
-    what they do to its physics, see `CableEffect`.
+    The simulator implements the effect; a diagnosis needs only these fields. Effects of your own simulator are
+    instances of this class, see `cablejax.diagnose.Simulator`; effects of a cable are subclasses that change its
+    physics, see `CableEffect`.
 
     Attributes:
         name: as in the verdict.

@@ -39,8 +39,8 @@ class ShapeCableConfig:
         randomisation: ranges of the physical parameters, drawn in each episode.
         interval: time for which an action is held [s].
         steps: actions after which an episode is truncated.
-        speed: of a gripper that an action of 1 asks for [lengths of the cable per second].
-        turn_rate: likewise [rad/s].
+        speed: speed of a gripper for an action of 1 [lengths of the cable per second].
+        turn_rate: turn rate of a gripper for an action of 1 [rad/s].
         tolerance: error at which an episode terminates [lengths of the cable].
         keypoint_noise: standard deviation of the observed keypoints [m] per coordinate.
     """

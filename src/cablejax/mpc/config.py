@@ -25,28 +25,29 @@ class MPCConfig:
         min_distance: least distance of the grippers, relative to L.
         max_distance: greatest distance of the grippers, relative to L: a taut cable cannot be shaped.
         workspace: lowest and highest corner (x, y) of where the grippers may be [m]; None = anywhere.
-        max_change: greatest norm of the change of a gripper's motion from one step to the next [m]: it bounds the
-            acceleration. Then holding means to brake, which may take steps. None = any.
-        radius: initial bound epsilon on one step's motion of each gripper [m]; adapted as a trust region is.
-        radius_min: it does not shrink below this [m].
-        radius_max: nor grow above this [m]: the model has not been trained on faster motions.
+        max_change: greatest norm of the change of a gripper's motion from one step to the next [m], a bound on the
+            acceleration. With it, holding still means braking, which may take several steps. None = any.
+        radius: initial bound epsilon on one step's motion of each gripper [m]; adapted like a trust region.
+        radius_min: smallest radius [m].
+        radius_max: largest radius [m]: the model has not been trained on faster motions.
         grow_above: eta+; the radius grows if actual over predicted error reduction is at least this.
-        shrink_below: eta-; it shrinks if the ratio is at most this.
-        grow: tau+.
-        shrink: tau-.
-        min_reduction: predicted changes of the error below this say nothing about the model: the radius stays [m].
+        shrink_below: eta-; the radius shrinks if the ratio is at most this.
+        grow: tau+, factor by which the radius grows.
+        shrink: tau-, factor by which the radius shrinks.
+        min_reduction: smallest predicted change of the error that says anything about the model; below, the radius
+            stays [m].
         hold_improvement: the grippers hold still if the plan lowers the error over the horizon, as a root mean square
             distance, by less than this compared with holding still [m].
         settle_after: commands without a lower error near the target after which the grippers rest.
-        arrived: way left to the best pose [m] at which the grippers count as being there.
+        arrived: distance from the best pose [m] at which the grippers count as being there.
         wake: rise of the error at rest [m] that counts as a disturbance: planning begins again.
-        restart_above: where the error stays above this [m], the cable is in another shape than the target's, between
-            the same grippers or others. No plan of a few steps leads out: it is straightened, and shaped from there.
-        restart_after: commands without a lower error after which it counts as staying; at once where no plan is better
-            than holding still.
-        max_restarts: how often that may happen; a shape that is fallen into again and again is the model's.
+        restart_above: if the error stays above this [m], the cable is in another shape than the target's, and no plan
+            of a few steps leads out: the controller straightens the cable, and shapes it from there.
+        restart_after: commands without a lower error after which the error counts as staying; at once if no plan is
+            better than holding still.
+        max_restarts: most restarts; if the cable falls into the same shape repeatedly, the model is wrong.
         objective: weights and units of the planning problem.
-        residual: settings of the online learner of its errors; None = trust the offline model.
+        residual: settings of the online learner of the model's errors; None = the offline model alone.
         adaptation: settings of the online estimate of the cable, for a conditioned model; None = no estimate.
         solver: any `Solver`.
     """

@@ -132,8 +132,8 @@ class MPCInfo:
         residual_share: |residual's displacement| / (|model's| + |residual's|) of the command, in [0, 1].
         condition: condition number of the ridge system; 1 where no ridge is fitted.
         unobserved: keypoints not observed now, replaced by their prediction.
-        weights: how far each of the learner's candidates is believed, shape [K]; None without a learner.
-        belief: what is believed of the cable now, None without adaptation.
+        weights: weight of each of the learner's candidates, shape [K]; None without a learner.
+        belief: current estimate of the cable; None without adaptation.
     """
 
     shape_error: Float[Array, "*batch"]

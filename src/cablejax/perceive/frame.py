@@ -40,14 +40,15 @@ class TrackerConfig:
         capacity: points that a frame is thinned or padded to.
         iterations: of registration per frame.
         reach: distance [m] within which a point supports the fit.
-        min_points: a cloud of fewer points is not looked at.
+        min_points: smallest cloud that is registered.
         min_support: part of the cloud that must be within reach of the cable.
         min_seen: part of the cable that must have points.
         max_sigma: largest standard deviation of the points across the cable [m].
-        max_curvature: largest curvature of the fit [1/m]. One that is too long for its cloud hides the rest in a fold.
-        max_search: largest standard deviation that a frame starts from [m]. It starts from the last frame's, plus the
-            way that the grippers have gone since.
-        retry: the cable is looked for without a prior in the first frame that does not fit, and then every so many.
+        max_curvature: largest curvature of the fit [1/m]: a cable that is too long for its cloud hides the surplus in a
+            fold.
+        max_search: largest initial standard deviation of a frame [m], which is the last frame's plus the distance that
+            the grippers have moved since.
+        retry: frames between searches without a prior, which begin with the first frame that does not fit.
     """
 
     registration: RegistrationConfig = dataclasses.field(default_factory=RegistrationConfig)

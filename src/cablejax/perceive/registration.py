@@ -37,8 +37,7 @@ MAX_TURN = 0.3
 class RegistrationConfig:
     """The cable to find, and the weight of each assumption about it.
 
-    The three weights are in nats: an assumption that is broken by the amount stated costs as much as one point of
-    likelihood `1/e`.
+    The three weights are in nats: breaking an assumption by one unit costs as much as one point of likelihood `1/e`.
 
     Attributes:
         length: free length of the cable between the grippers [m].
@@ -47,14 +46,14 @@ class RegistrationConfig:
         outlier_weight: mu, prior probability of an outlier.
         area: over which outliers are spread [m^2].
         min_sigma: least standard deviation of the points across the cable [m].
-        settled_sigma: standard deviation [m] down to which annealing is forced: what noise and thickness of the cable
-            may well amount to.
+        settled_sigma: standard deviation [m] down to which annealing is forced: a plausible size of the noise and the
+            cable's thickness.
         coherence: weight of coherent motion [1/m^2]: 1/2 of it times the squared norm of the displacement field.
         kernel_width: distance over which motion coheres, in lengths of the cable.
         structure: weight of the local linear embedding [1/m^2].
-        bending: weight of the bending energy `1/2 int curvature^2 ds` [m]. A uniform cable rests where this energy
-            is least, so the term does not move it, and it decides where nothing is seen. A cable with bends of its own
-            is drawn to the straight: give less for one.
+        bending: weight of the bending energy `1/2 int curvature^2 ds` [m]. A uniform cable rests where this energy is
+            least, so the term hardly shifts it, and determines hidden stretches. It straightens a cable with permanent
+            bends: use a smaller weight there.
     """
 
     length: float = 1.0

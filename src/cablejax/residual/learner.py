@@ -67,17 +67,18 @@ class LearnerConfig:
     """Settings of the online learner.
 
     Attributes:
-        candidates: what is weighed; a single one is always believed.
+        candidates: the candidates; a single one always has weight 1.
         window: samples W that they are fitted to.
-        forgetting: weight ratio of a sample and the next newer one where shares are fitted, in (0, 1].
-        drift_floor: root mean square drift [m] below which its share is not learned: the error is noise there.
+        forgetting: weight ratio of a sample and the next newer one in fits of shares, in (0, 1].
+        drift_floor: root mean square drift [m] below which the share of the drift is not learned, since the error is
+            noise.
         response_floor: the same of a keypoint's response in all samples together, in units of s(t).
         memory: phi, by which evidence fades in one step, in (0, 1].
         error_std: s, root mean square error of a good prediction at rest [m].
         error_ratio: r, the same relative to the grippers' speed [s]: a tenth of their motion in a step of a second.
         rotation_weight: w [m/rad], turns a rotation into a length.
         outlier: root mean square error [m] beyond which a step that no candidate predicted counts less and less, as in
-            `RidgeConfig`: that a cable has snapped through says little about any of them.
+            `RidgeConfig`: a snap-through says little about any candidate.
         dimensions: d, independent numbers in the error of one step; neighbouring keypoints err alike.
     """
 

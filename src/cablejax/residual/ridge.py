@@ -35,14 +35,14 @@ class RidgeConfig:
         regularisation: the penalty lambda on the scaled coefficients.
         motion_scale: gripper speed that counts as one unit of regressor [m/s]: a centimetre in a step of a second.
         rotation_weight: w [m/rad], turns a rotation into a length before scaling.
-        bias: whether the error at rest is fitted too. Without it an error that does not vanish with the motion (a wrong
-            steady state, friction) ends up in the gain, or nowhere once the grippers are still.
+        bias: whether the error at rest is fitted too. Without a bias, an error that does not vanish with the motion (a
+            wrong steady state, friction) is attributed to the gain, or ignored once the grippers are still.
         forgetting: weight ratio of a sample and the next newer one, in (0, 1]; 1 weighs all alike. On the way to a
             shape the error changes from step to step, so the newest sample says most about the next.
-        outlier: root mean square error of a sample [m] beyond which it counts less and less. Where the model follows
-            another branch than the cable (one has snapped through, the other is held by friction) it is off by
-            decimetres, not by something linear in the command; carried over a horizon, such a residual makes every
-            plan look worse than standing still. Infinite = all samples are believed.
+        outlier: root mean square error of a sample [m] beyond which it counts less and less. If model and cable follow
+            different branches (one has snapped through, friction holds the other), the error is decimetres and not
+            linear in the command; over a horizon, such a residual makes every plan look worse than standing still.
+            Infinite = all samples count fully.
     """
 
     regularisation: float = 10.0

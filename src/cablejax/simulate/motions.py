@@ -41,9 +41,9 @@ class MotionConfig:
         min_distance: least distance of the grippers, relative to the length.
         max_angle: largest angle between a gripper and the line through both [rad].
         max_curvature: that the grippers may force upon the cable near taut [1/m].
-        max_amplification: largest movement of any point of the cable's equilibrium, relative to the sum of what the
-            grippers move. It keeps the cable from snapping through from one shape to another, which a small change of
-            the start can delay or prevent. A large number lets it snap.
+        max_amplification: largest movement of any point of the cable's equilibrium, relative to the sum of the
+            grippers' movements. The limit keeps the cable from snapping through to another shape, which a small change
+            of the start can delay or prevent. A large number lets it snap.
     """
 
     start: Literal["straight", "random"] = "straight"

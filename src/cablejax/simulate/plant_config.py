@@ -20,8 +20,8 @@ class ObservedConfig:
     """Base of the plants' configurations: the cable, its effects, and how it is observed.
 
     Attributes:
-        discretisation: the cable as it is believed to be, its links and time step.
-        effects: what the plant does beyond that cable, in this order.
+        discretisation: the nominal cable, its links and time step.
+        effects: effects of the plant beyond the nominal cable, in this order.
         keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
         keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last, which the
             grippers hold.

@@ -24,8 +24,8 @@ class PlantConfig(ObservedConfig):
     """Configuration of the plant; the defaults are the reference cable, finer than the trained one.
 
     Attributes:
-        discretisation: the cable as it is believed to be, its links and time step. `friction_speed` has no meaning
-            here and `dimension` must be 3.
+        discretisation: the nominal cable, its links and time step. `friction_speed` is ignored and `dimension` must be
+            3.
         settle_time: simulated time [s] given to a new cable to settle: without friction, with it, and once more after
             the grippers have come down to the height at which it lies.
 
