@@ -9,8 +9,8 @@ import pytest
 from cablejax.diagnose import diagnose, verdict_json
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.case import Case
+from cablejax.diagnose.caveats import caveats_of
 from cablejax.diagnose.length import other_length
-from cablejax.diagnose.planar_run import _caveats
 from cablejax.diagnose.reading import with_readings
 from cablejax.types import GapLog
 from diagnose_cases import record
@@ -54,7 +54,7 @@ def test_caveat_on_keypoints_that_do_not_fit_the_length():
     log = stated(record(), 1.01)
     case = Case.of(log)
     length = other_length(case, log)
-    (text,) = _caveats(case, Calibration(), length, 0.0, commissioned=True)
+    (text,) = caveats_of(case, Calibration(), length, 0.0, commissioned=True)
     assert re.match(r"Keypoints are 1\.0 % closer together than the stated arc lengths, in every episode", text)
     assert length.assumes in with_readings(case, [length]).simulator.other_laws
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,13 +17,14 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.evidence import Evidence, repeated_motions
 from cablejax.diagnose.log_faults import steadied
 from cablejax.diagnose.noise import NoiseFloor, noise_floor
-from cablejax.diagnose.planar import PlanarCable
+from cablejax.diagnose.planar import PlanarCable, physics_of
 from cablejax.diagnose.playback import Playback
+from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
 from cablejax.diagnose.regimes import largest_curvature
 from cablejax.diagnose.run import weighed
 from cablejax.effects import LIBRARY, CableEffect
-from cablejax.effects.physics import nominal_physics
+from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP, SETTLING
 from cablejax.types import GapLog
 
@@ -142,13 +142,15 @@ class Case:
             predicted=dataclasses.replace(simulator, playback=predicted),
         )
 
-    def evidence(self, calibration: Calibration) -> Evidence:
+    def evidence(self, calibration: Calibration, growth: Float[np.ndarray, "E"] | None = None) -> Evidence:
         """The log as evidence, weighed by the noise and the simulator's baseline error.
 
-        In an episode in which small errors grow, as where the cable comes close to snapping over, the simulator may be
-        off by as many times more as an error of the clamps' angles moves the cable more than usual; and by what stated
-        numbers matter more than usual.
+        Args:
+            calibration: of the judgement.
+            growth: of small errors in each episode, see `growth`; None = on the nominal cable. The simulator may be off
+                by as many times more there, and by what stated numbers matter more than usual.
         """
+        growth = self.growth(explanation()) if growth is None else growth
         more = np.maximum(self._stated - np.median(self._stated), 0.0)
         return weighed(
             self.simulator,
@@ -157,7 +159,7 @@ class Case:
             self.noise.std[:, None],
             self.motion,
             calibration,
-            own_error=np.sqrt((calibration.baseline * self._growth) ** 2 + more),
+            own_error=np.sqrt((calibration.baseline * growth) ** 2 + more),
         )
 
     def stated_error(self) -> float:
@@ -173,32 +175,35 @@ class Case:
         """Squares of `stated_error`, of each episode."""
         believed = self.simulator.playback.believed
         return self._moved_by(
-            {name: getattr(believed, name) * (1 + sign * STATED)}
+            dataclasses.replace(believed, **{name: getattr(believed, name) * (1 + sign * STATED)})
             for name in ("stiffness", "friction")
             for sign in (-1, 1)
         )
 
-    @functools.cached_property
-    def _growth(self) -> Float[np.ndarray, "E"]:
-        """How many times more than usual an error of the clamps' angles moves the cable in each episode, at least 1."""
-        believed = self.simulator.playback.believed
+    def growth(self, cause: Explanation) -> Float[np.ndarray, "E"]:
+        """How many times more than usual small errors move a cable in each episode, at least 1.
+
+        They do where the cable comes close to snapping over. The small error is one of the clamps' angles.
+
+        Args:
+            cause: of the gap: the cable with these effects.
+        """
+        cable = physics_of(cause, self.simulator.playback.believed, self.config)
+        askew = CLAMP_PROBE * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], np.float32)
         moved = np.sqrt(
             self._moved_by(
-                {"rotation_offset": believed.rotation_offset + np.float32(sign * CLAMP_PROBE) * clamp}
-                for clamp in np.eye(2, dtype=np.float32)
-                for sign in (-1, 1)
+                dataclasses.replace(cable, rotation_offset=cable.rotation_offset + angles) for angles in askew
             )
         )
         return np.maximum(moved / max(float(np.median(moved)), 1e-9), 1.0)
 
-    def _moved_by(self, changes: Iterable[dict[str, Any]]) -> Float[np.ndarray, "E"]:
-        """Mean squares of each episode [m^2] by which changes of the believed cable move it, together.
+    def _moved_by(self, cables: Iterable[Physics]) -> Float[np.ndarray, "E"]:
+        """Mean squares of each episode [m^2] by which changes of a cable move it, together.
 
         Args:
-            changes: pairs of one down and one up.
+            cables: pairs of one changed down and one changed up.
         """
-        playback = self.simulator.playback
-        points = playback.keypoints([dataclasses.replace(playback.believed, **change) for change in changes])
+        points = self.simulator.playback.keypoints(list(cables))
         pairs = points.astype(np.float64).reshape(-1, 2, *points.shape[1:])
         return self._squares(((pairs[:, 1] - pairs[:, 0]) ** 2).sum(axis=0) / 4)
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from cablejax.diagnose.actuation_verdict import with_arms
-from cablejax.diagnose.belief import Calibration, excess, excused
-from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, STATED, Case
+from cablejax.diagnose.belief import Calibration, excess
+from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case
+from cablejax.diagnose.caveats import caveats_of, contradictions, silent_motions
 from cablejax.diagnose.conclude import Conclusion, sentence
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NextMotion
 from cablejax.diagnose.evidence import Evidence
@@ -20,13 +21,12 @@ from cablejax.diagnose.gap import held_out_predictions, measure_gap
 from cablejax.diagnose.length import Length, other_length
 from cablejax.diagnose.motion_bounds import Bounds, BoundsError
 from cablejax.diagnose.motion_design import DesignConfig
-from cablejax.diagnose.motion_judge import MARGIN, Judge, Objective
+from cablejax.diagnose.motion_judge import Judge, Objective
 from cablejax.diagnose.next_motion import next_motion, require_some_motion
-from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.reading import Reading, held, with_readings
 from cablejax.diagnose.reference import ahead_of_observations
-from cablejax.diagnose.rounds import UNLIKELY, Rounds, rounds_of
+from cablejax.diagnose.rounds import rounds_of
 from cablejax.diagnose.run import Examined, explain, settings_of
 from cablejax.diagnose.search import Search
 from cablejax.diagnose.where import localise
@@ -40,8 +40,8 @@ _ARMS_TOO = {
     **dict.fromkeys(("named", "ambiguous"), f"With the measured poses: {{}} {_ARMS}"),
 }
 """Sentences of a log in which arms stray, by the verdict on the cable alone."""
-# Reported: holds in which keypoints scatter by this many times what they do between samples.
-_SCATTERED = 1.5
+# Growth of small errors that an explanation may have beyond what its evidence was weighed by.
+_MORE_GROWTH = 3.0
 
 
 def diagnose(
@@ -72,14 +72,8 @@ def diagnose(
         BoundsError: no motion of the cable keeps all bounds; says how many each bound excludes.
     """
     begin = time.perf_counter()
-    given, stated, case = calibration, 0.0, Case.of(log, effects)
-    calibration = given or calibrated(log.meta["cable"]["length_m"])
-    if commissioning:
-        calibration = dataclasses.replace(calibration, baseline=_commissioned(log, commissioning))
-    if given is None:
-        stated = case.stated_error()
-        assumed = float(np.linalg.norm([calibration.baseline, stated, case.pose_error()]))
-        calibration = dataclasses.replace(calibration, baseline=assumed)
+    case = Case.of(log, effects)
+    calibration, stated = _constants(log, case, calibration, commissioning)
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
     log, case, evidence, found, conclusion, length, taken = _read(log, case, calibration, progress)
@@ -98,7 +92,8 @@ def diagnose(
         following, none_kept = _following(judge, None if bounds is None else DesignConfig())
     repaired = case.recording.as_log(log.meta)
     rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
-    caveats = _caveats(case, calibration, length, stated, commissioned=bool(commissioning))
+    caveats = [*contradictions(rounds), *silent_motions(evidence, conclusion, calibration)]
+    caveats += [*caveats_of(case, calibration, length, stated, commissioned=bool(commissioning)), *none_kept]
     fields = Examined(evidence, found, conclusion, reference, after, gap).fields()
     if case.arms.strays(calibration.smallest_gap(0.0)) and alone.verdict in _ARMS_TOO:
         # what is left of the gap is theirs: not a share that right explanations leave, nor for an unknown cause to take
@@ -111,7 +106,7 @@ def diagnose(
         **fields,
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
-        caveats=(*_contradictions(rounds), *_excused(evidence, conclusion, calibration), *caveats, *none_kept),
+        caveats=tuple(caveats),
         log=repaired,
         nominal=case.to_log(reference),
         explained=None if conclusion.verdict == "none" else case.to_log(after),
@@ -124,6 +119,20 @@ def diagnose(
     for reading, probability in taken:
         diagnosis = reading.told(diagnosis, probability)
     return diagnosis
+
+
+def _constants(
+    log: GapLog, case: Case, given: Calibration | None, commissioning: Sequence[GapLog]
+) -> tuple[Calibration, float]:
+    """The constants of the judgement, and what wrongly stated numbers make of them [m]; 0 with constants given."""
+    calibration, stated = given or calibrated(log.meta["cable"]["length_m"]), 0.0
+    if commissioning:
+        calibration = dataclasses.replace(calibration, baseline=_commissioned(log, commissioning))
+    if given is None:
+        stated = case.stated_error()
+        assumed = float(np.linalg.norm([calibration.baseline, stated, case.pose_error()]))
+        calibration = dataclasses.replace(calibration, baseline=assumed)
+    return calibration, stated
 
 
 def _read(
@@ -140,8 +149,7 @@ def _read(
         length = None if any(isinstance(one, Length) for one, _ in taken) else other_length(case, log)
         readings = [one for one in (length, held(case, log, calibration)) if one is not None]
         case = with_readings(case, readings)
-        evidence = case.evidence(calibration)
-        found, conclusion = explain(evidence, calibration, progress=progress)
+        evidence, found, conclusion = _explained(case, calibration, progress)
         likely = [(one, one.probability(conclusion.under_laws)) for one in readings]
         reading, probability = max(likely, key=lambda one: one[1], default=(None, 0.0))
         if reading is None or reading.case is None or probability <= 0.5:
@@ -149,6 +157,25 @@ def _read(
         progress(f"again, as {reading.assumes}")
         taken.append((reading, probability))
         log, case = reading.log, reading.case
+
+
+def _explained(
+    case: Case, calibration: Calibration, progress: Callable[[str], None]
+) -> tuple[Evidence, Search, Conclusion]:
+    """Explains a case, and again where small errors grow more under the best explanation than was assumed.
+
+    A soft cable may snap over in a motion in which the stated one does not. Explanations would then be judged by how
+    they err there.
+    """
+    growth = case.growth(explanation())
+    while True:
+        evidence = case.evidence(calibration, growth)
+        found, conclusion = explain(evidence, calibration, progress=progress)
+        under = np.maximum(growth, case.growth(conclusion.best.explanation))
+        if (under <= _MORE_GROWTH * growth).all():
+            return evidence, found, conclusion
+        progress("again, as small errors grow under the best explanation")
+        growth = under
 
 
 def _following(judge: Judge, design: DesignConfig | None) -> tuple[NextMotion | None, tuple[str, ...]]:
@@ -217,83 +244,3 @@ def _worth_naming(conclusion: Conclusion, shrinkage: float | None) -> Conclusion
         dataclasses.replace(law, **nothing) if law.verdict == "named+unknown" else law for law in conclusion.under_laws
     )
     return dataclasses.replace(conclusion, **nothing, posterior=(), nothing=0.0, under_laws=under)
-
-
-def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
-    if rounds is None or not rounds.contradictory:
-        return ()
-    return (
-        f"The recordings contradict one another: {rounds.odd_one.name} is explained best with other parameters than "
-        f"the rest, as recordings of one set-up would be in fewer than {UNLIKELY:g} of all cases. Check what was "
-        "changed between them, and diagnose each one alone.",
-    )
-
-
-def _excused(evidence: Evidence, conclusion: Conclusion, calibration: Calibration) -> Iterator[str]:
-    """What the verdict "none" leaves out, if anything."""
-    if conclusion.verdict != "none":
-        return
-    for episode, gap, own in excused(conclusion.best, evidence, calibration):
-        yield (
-            f"Episode {episode} says nothing for or against a gap: the nominal simulator misses the cable by "
-            f"{1e3 * gap:.2g} mm per coordinate there, and may be off by {1e3 * own:.2g} mm without any effect, for "
-            "small errors grow in it, as where a cable snaps over or is wrung by a wrong pose. Look at it, or record a "
-            "calmer motion."
-        )
-
-
-def _caveats(
-    case: Case, calibration: Calibration, length: Length | None, stated: float, *, commissioned: bool
-) -> tuple[str, ...]:
-    caveats = list(case.recording.caveats)
-    if not commissioned:
-        caveats.append(
-            "No commissioning logs were given: the simulator's own error is not separated from the cable's gap; "
-            f"{1e3 * calibration.baseline:.2g} mm of it is assumed."
-        )
-    if stated > Calibration.baseline:
-        caveats.append(
-            f"This cable is sensitive to its stated numbers: {100 * STATED:g} % more or less stiffness or friction "
-            f"moves keypoints by {1e3 * stated:.2g} mm per coordinate, and a gap must be larger to count."
-        )
-    if case.scatter.any():
-        caveats.append(
-            f"The measured gripper poses scatter by up to {1e3 * case.scatter[:, :2].max():.2g} mm and "
-            f"{1e3 * case.scatter[:, 2].max():.2g} mrad from one sample to the next. They are smoothed, or they would "
-            "shake the simulated cable."
-        )
-    if case.arms.strays(calibration.smallest_gap(0.0)):
-        caveats.append(
-            f"The measured poses are {1e3 * case.arms.deviation:.3g} mm (root mean square) from where the commands "
-            "lead, and neither a gain nor a lag explains that. Check the frame and the units of gripper_command, "
-            "whether the commands of both arms were logged, and whether every motion was executed whole."
-        )
-    if case.recording.has_commands:
-        off = np.linalg.norm((case.recording.gripper_pose - case.arms.commanded)[..., :2], axis=-1).max(axis=(1, 2))
-        if off.max() > MARGIN:
-            caveats.append(
-                f"Motions were not executed as commanded: the grippers of episode {int(off.argmax())} are up to "
-                f"{1e3 * off.max():.0f} mm from their commands, more than the {1e3 * MARGIN:g} mm by which a designed "
-                "motion keeps its bounds. The diagnosis uses the measured poses. If that was not meant, record them "
-                "again, or leave out their commands."
-            )
-    scatter, rapid = float(np.median(case.noise.std)), case.noise.rapid
-    if case.noise.from_holds and rapid > 0 and scatter > _SCATTERED * rapid:
-        caveats.append(
-            f"Keypoints scatter by {1e3 * scatter:.2g} mm while the grippers rest, and by {1e3 * rapid:.2g} mm from "
-            "one sample to the next: their noise is correlated, or the cable still moves in what is marked as holds. "
-            "The larger number is taken for the noise, and gaps below it are not seen."
-        )
-    if case.noise.restless:
-        caveats.append(
-            f"In {case.noise.restless} of the holds the keypoints scatter far more than in the others: the cable moves "
-            "there, and they say nothing of the noise. Mark as holds what is at rest, the cable included."
-        )
-    if length is not None:
-        caveats.append(
-            f"Keypoints are {length.apart}. A wrong length_m or keypoint_arclength_m does that, as do a camera's scale "
-            "and a cable that stretches: check the length before you believe either of these."
-        )
-    if case.noise.std.max() <= SMALLEST:
-        caveats.append(f"The keypoints carry no noise to speak of; {1e3 * SMALLEST:g} mm is assumed.")
-    return tuple(caveats)
