@@ -43,5 +43,23 @@ def swinging(samples: int = 200, seed: int = 0, phase: float = 0.0) -> np.ndarra
     return points + moved[:, None] + np.random.default_rng(seed).normal(scale=3e-4, size=points.shape)
 
 
+def arch(marks: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Keypoints of a cable that bends from each angle at gripper 0 to its opposite at gripper 1, shape [T, N, 2]."""
+    fine = np.linspace(0.0, marks[-1], 2001)
+    turn = angles[:, None] * np.cos(np.pi * fine / marks[-1])
+    step = 0.5 * (fine[1] - fine[0])
+    sums = (np.cumsum(part[:, 1:] + part[:, :-1], axis=1) * step for part in (np.cos(turn), np.sin(turn)))
+    return np.stack([[np.interp(marks, fine, np.append(0.0, row)) for row in rows] for rows in sums], axis=-1)
+
+
+def arch_take(marks: np.ndarray, angles: np.ndarray, name: str = "a", noise: float = 0.0) -> Take:
+    """The same as a take with measured grippers; 10 Hz."""
+    points = arch(marks, angles)
+    tangent = np.stack([angles, -angles], axis=1)[..., None]
+    pose = np.concatenate([points[:, [0, -1]], tangent], axis=2)
+    seen = points + noise * np.random.default_rng(0).standard_normal(points.shape)
+    return Take(name, 0.1 * np.arange(len(points)), seen, pose)
+
+
 def take(points: np.ndarray, name: str = "a", pose: np.ndarray | None = None) -> Take:
     return Take(name, DT * np.arange(len(points)), points, pose)

@@ -9,7 +9,16 @@ import pytest
 
 from cablejax.cable import NUMBERS as CABLE_NUMBERS
 from cablejax.cable import Cable
-from cablejax.cable_file import KEYS, NUMBERS, cable_from_fields, cable_text, cable_to_fields, read_cable, write_cable
+from cablejax.cable_file import (
+    KEYS,
+    NUMBERS,
+    cable_from_fields,
+    cable_of_log,
+    cable_text,
+    cable_to_fields,
+    read_cable,
+    write_cable,
+)
 from cablejax.cli import main
 from cablejax.commands.cable import find_cable
 from cablejax.dataset.opening import open_or_create
@@ -144,3 +153,11 @@ def test_the_command_writes_the_reference_and_does_not_overwrite(tmp_path, capsy
     assert main(["cable", "--from", "nothing"]) == 2
     assert "nothing" in capsys.readouterr().err
     assert pathlib.Path(out).read_text() == cable_text(OTHER)
+
+
+def test_marks_of_a_log_that_nearly_reach_the_ends_are_those_of_the_ends():
+    log = gap_log_from_episodes([at_rest(OTHER)], OTHER, source="test")
+    marks = [round(float(s), 4) for s in log.meta["keypoint_arclength_m"]]
+    log.meta["keypoint_arclength_m"] = [marks[0], *marks[1:-1], 0.9996 * OTHER.length]
+    cable = cable_of_log(log)
+    np.testing.assert_allclose(cable.keypoint_arclength, [*marks[:-1], OTHER.length])

@@ -82,3 +82,12 @@ def test_cables_given_by_lists_are_hashable_and_differ_by_more_than_rounding_onl
     assert not differing(listed, Cable(n_keypoints=3, marks=(0.0, 0.1 + 0.2, 1.0)))
     assert not differing(Cable(n_keypoints=3), Cable(n_keypoints=3, marks=(0.0, 0.5, 1.0)))
     assert "marks" in differing(listed, Cable(n_keypoints=3))
+
+
+@pytest.mark.parametrize("marks", [[0, 0.1, 0.5, 0.9, 1], [0, 0.03, 0.5, 0.97, 1], [0, 0.5, 1]])
+def test_a_ring_is_long_enough_wherever_its_keypoints_are(marks):
+    angle = 2 * np.pi * np.array(marks)
+    ring = np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1) / (2 * np.pi)
+    require_fitting_length([np.repeat(ring[None], 20, axis=0)], np.array(marks, float), NAME)
+    with pytest.raises(ValueError, match="the cable usually measures"):
+        require_fitting_length([np.repeat(0.8 * ring[None], 20, axis=0)], np.array(marks, float), NAME)

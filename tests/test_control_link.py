@@ -476,3 +476,13 @@ def test_limits_that_leave_no_motion_are_reported():
 def test_nothing_recorded_is_no_log():
     with pytest.raises(GapLogError, match="at least one episode"):
         RunLog().gap_log(TARGET, CABLE, "test")
+
+
+def test_a_slow_tracker_whose_clock_jitters_makes_one_episode():
+    harness = Harness(watchdog=3.0, steps=30)
+    jitter = 2e-3 * np.random.default_rng(0).standard_normal(12)
+    for k in range(12):
+        time = k + jitter[k]
+        harness.step(time, harness.seen(time))
+    log = harness.log.gap_log(TARGET, CABLE, "test")
+    assert log.episode_length.tolist() == [12]

@@ -19,6 +19,7 @@ from cablejax.diagnose.verdict_json import verdict_json, write_verdict
 from cablejax.diagnose.where import localise
 from cablejax.gaplog import write_gap_log
 from cablejax.report.diagnosis_charts import ranking_figure
+from cablejax.report.diagnosis_figures import where_figure
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.diagnosis_sections import ranking_note
 from cablejax.report.effect_words import effect_place, quantity, share
@@ -414,6 +415,7 @@ def test_failed_write_leaves_the_verdict_that_was_there(tmp_path):
         ((1, ""), "1"),
         ((float("nan"), "m"), "n/a"),
         ((12.0, "s"), "12.0 s"),
+        ((1.2e-7, "N m^2", (1e-7, 1.4e-7)), "1.2e-07 N m^2 (1e-07 to 1.4e-07)"),
         ((0.3, "rad", (0.3, 0.3)), "0.300 rad (0.300 to 0.300)"),
     ],
 )
@@ -439,3 +441,22 @@ def test_a_name_that_unseen_motions_do_not_confirm_is_said_to_be_fitted(shrinkag
     share = 93 if shrinkage is None or not confirmed else 90
     assert said.startswith(f"The gap comes from friction patch, which explains {share} % of it.")
     assert ("unconfirmed: on motions left out of the fit" in said) == (not confirmed)
+
+
+def test_the_figure_has_keypoints_and_times_where_they_are():
+    """Uneven keypoints, one of them never observed, and a clock that does not begin at zero."""
+    made = diagnosis()
+    marks = np.linspace(0.0, 1.0, POINTS) ** 2
+    keypoints = np.array(made.log.keypoints)
+    keypoints[:, :, 4] = np.nan
+    meta = {**made.log.meta, "keypoint_arclength_m": marks.tolist()}
+    log = dataclasses.replace(made.log, keypoints=keypoints, time=made.log.time + 50.0, meta=meta)
+    changed = dataclasses.replace(made, log=log, where=localise(log, made.nominal, np.full(POINTS, 1e-3)))
+    figure = where_figure(changed)
+    maps = [collection for ax in figure.axes for collection in ax.collections if hasattr(collection, "get_coordinates")]
+    for cells in maps[: len(log.episode_length)]:
+        corners = cells.get_coordinates()
+        time, along = corners[0, :, 0], corners[:, 0, 1]
+        assert time[0] == pytest.approx(50.0, abs=0.1) and (along[:-1] < marks).all() and (marks < along[1:]).all()
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert "nan" not in " ".join(texts) and np.isnan(changed.where.along_cable_mm[4])

@@ -274,3 +274,10 @@ def test_files_of_other_programs_are_refused(tmp_path):
         read_mcap(tmp_path / "other.mcap")
     with pytest.raises(FileNotFoundError):
         read_mcap(tmp_path / "absent.mcap")
+
+
+def test_fields_of_other_programs_may_hold_what_json_has_no_word_for(tmp_path):
+    log = planar()
+    log.meta["theirs"] = {"offset": float("nan")}
+    for write, read, name in FORMATS.values():
+        assert np.isnan(read(write(tmp_path / name, log)).meta["theirs"]["offset"])

@@ -23,9 +23,11 @@ from cablejax.gaplog import (
     write_gap_log,
 )
 from cablejax.gaplog_join import chosen, commands_derived, joined, recordings
+from cablejax.log_geometry import setup_fault
 from cablejax.text_file import parse_json
 from cablejax.types import GapLog
 from file_cases import with_other_bytes
+from recording_cases import arch_take
 
 CABLE = Cable(n_keypoints=5)
 CABLE_META = {
@@ -447,3 +449,38 @@ def test_targets_of_joined_recordings_stay_with_their_episodes():
 def test_the_beginning_of_a_log_whose_clock_ran_before(log):
     later = dataclasses.replace(log, time=log.time + 100.0)
     np.testing.assert_array_equal(until(later, 0.35).episode_length, until(log, 0.35).episode_length)
+
+
+def test_a_gripper_far_from_the_next_keypoint_shows_no_direction():
+    """A chord of 0.4 m of a bent cable may be at any angle to the clamp; one of 0.1 m may not."""
+    for first, fault in ((0.4, False), (0.1, True)):
+        marks = np.array([0.0, first, 0.45, 0.5, 0.6, 1.0])
+        one = arch_take(marks, np.linspace(1.4, 1.6, 30))
+        pose = one.gripper_pose.copy()
+        pose[:, 0, 2] += 0.0 if first > 0.3 else 1.3
+        episode = Episode("bend", one.time, one.keypoints, pose, np.zeros((30, 2, 3)), np.zeros(30, bool))
+        bent = gap_log_from_episodes([episode], Cable(n_keypoints=6, marks=tuple(marks)), source="test")
+        assert (setup_fault(bent) is not None) == fault
+
+
+def test_lengths_of_episodes_that_do_not_fit_their_type_are_refused(tmp_path, log):
+    path = write_gap_log(tmp_path / "run.npz", log)
+    with np.load(path) as file:
+        arrays = dict(file)
+    arrays["episode_length"] = arrays["episode_length"].astype(np.int64) + 2**32
+    np.savez(tmp_path / "wide.npz", **arrays)
+    with pytest.raises(GapLogError, match=r"field 'episode_length' has 42949\d+, too large for int32"):
+        read_gap_log(tmp_path / "wide.npz")
+
+
+@pytest.mark.parametrize("interval", [1e-4, 1.004])
+def test_the_clock_may_be_as_fast_and_as_slow_as_trackers_are(log, interval):
+    validate(
+        dataclasses.replace(log, time=np.broadcast_to(interval * np.arange(log.time.shape[1]), log.time.shape).copy())
+    )
+
+
+def test_another_programs_guesses_are_left_alone(log):
+    moved = log.keypoints + np.float32(1e-3)
+    other = dataclasses.replace(log, keypoints=moved, meta={**log.meta, "guessed": "diameter_m"})
+    assert "guessed" not in joined([log, other], ["one", "other"]).meta

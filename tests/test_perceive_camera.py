@@ -87,6 +87,15 @@ def test_impossible_cameras_are_refused(change, message):
         CameraConfig(**change)
 
 
+def test_a_cable_in_the_noise_of_the_range_is_refused():
+    thin = dataclasses.replace(CABLE, cable=dataclasses.replace(CABLE.cable, diameter=0.004))
+    with pytest.raises(ValueError, match=r"a cable of 4 mm does not stand out .* less than 1\.6 mm"):
+        DepthCamera(CAMERA, thin)
+    solution = lying(TARGET.gripper_pose)
+    points = DepthCamera(dataclasses.replace(CAMERA, range_noise=0.001), thin).look(*solution)
+    assert len(points) > 100 and (np.abs(offsets(points)) < 0.02).mean() > 0.9
+
+
 def test_a_camera_that_sees_the_horizon_is_refused():
     with pytest.raises(ValueError, match="horizon"):
         DepthCamera(CameraConfig(tilt=1.2, field_of_view=1.0), CABLE)

@@ -262,3 +262,12 @@ def test_the_example_in_the_documentation_works(tmp_path):
     bag = write_bag(tmp_path / "bag", points, grippers_of(points), StoragePlugin.MCAP)
     log, _ = import_mcap(bag, layout(tmp_path, text))
     assert log.keypoints.shape == (1, 119, 9, 3)  # the last sample is after the last pose of a gripper
+
+
+@pytest.mark.parametrize("stride", [6, 7])
+def test_poses_at_any_rate_that_is_accepted_are_known_between_their_stamps(tmp_path, stride):
+    points = swinging(201)
+    bag = write_bag(tmp_path / "bag", points, grippers_of(points, stride=stride), StoragePlugin.MCAP)
+    log, _ = import_mcap(bag, layout(tmp_path))
+    last = 200 // stride * stride
+    assert log.episode_length.tolist()[0] in range(last - 1, last + 3) and len(log.episode_length) == 1

@@ -104,6 +104,14 @@ def test_a_table_seen_from_above_with_measured_grippers(tmp_path):
     np.testing.assert_allclose(log.gripper_command[0, :-1, 0], np.tile([0.01, 0, np.pi / 2], (19, 1)), atol=1e-5)
 
 
+def test_a_take_ends_where_the_motion_has_another_name(tmp_path):
+    table = in_the_plane()
+    table["run"] = ["1"] * 40
+    table["t"] = 0.1 * np.arange(40)
+    log, _ = import_csv(*written(tmp_path, table, PLANAR))
+    assert log.meta["motion"] == ["approach", "mirror"] and log.episode_length.tolist() == [20, 20]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -14,7 +14,7 @@ from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
 from cablejax.recordings.prepare import Setup, prepare
 from cablejax.recordings.take import Take
-from recording_cases import DATA, DT, SPACING, needs_deform, swinging, take
+from recording_cases import DATA, DT, SPACING, arch, arch_take, needs_deform, swinging, take
 
 HELD = (0, 1, 7, 8)
 PAIRS = Setup(unit="m", on_grippers="pairs")
@@ -513,3 +513,58 @@ def test_the_arc_length_is_that_of_the_curve_and_not_of_its_chords():
     assert abs(measured - true).max() < 5e-4
     chords = np.linalg.norm(np.diff(swinging(), axis=1), axis=-1).mean(axis=0).sum()
     assert true[-1] - chords > 4 * abs(measured[-1] - true[-1])
+
+
+ON_TABLE = Setup(on_grippers="ends", hangs=False)
+
+
+@pytest.mark.parametrize(("count", "angles"), [(3, (1.4, 1.8)), (4, (2.0, 2.6)), (4, (2.6, 1.2))])
+def test_few_keypoints_of_an_ordinary_arch_keep_their_names(count, angles):
+    right = arch_take(np.linspace(0.0, 1.0, count), np.linspace(*angles, 100))
+    (made,), told = prepare((right,), ON_TABLE)
+    np.testing.assert_allclose(made.keypoints, right.keypoints, atol=1e-12)
+    assert told == []
+
+
+def test_a_cable_that_is_pulled_straight_is_the_same_cable_however_few_keypoints_it_has():
+    marks = np.linspace(0.0, 1.0, 7)
+    bent, taut = np.full(40, 2.2) + 0.2 * np.linspace(0, 1, 40), np.linspace(0.1, 0.3, 40)
+    takes, told = prepare((arch_take(marks, bent, "bent"), arch_take(marks, taut, "taut")), ON_TABLE)
+    assert [one.name for one in takes] == ["bent", "taut"] and told == []
+    three = np.linspace(0.0, 1.0, 3)
+    takes = (*(arch_take(three, bent - 0.6, str(k)) for k in range(5)), arch_take(three, taut, "taut"))
+    assert len(prepare(takes, ON_TABLE)[0]) == 6
+
+
+def test_noise_at_a_high_rate_is_no_jump():
+    time = 1e-3 * np.arange(2000)
+    points = arch(np.linspace(0.0, 1.0, 5), 1.0 + 0.4 * np.sin(time))
+    points += 2e-4 * np.random.default_rng(0).standard_normal(points.shape)
+    pose = np.concatenate([points[:, [0, -1]], np.zeros((2000, 2, 1))], axis=2)
+    parts, told = cut_at_gaps((Take("a", time, points, pose),), None)
+    assert samples_of(parts) == [("a", 2000)] and told == []
+    # as large as before, and lost samples are found
+    lost = np.delete(np.arange(2000), np.arange(900, 1000))
+    parts, told = cut_at_gaps((Take("a", time[:1900], points[lost], pose[lost]),), None)
+    assert samples_of(parts) == [("a/1", 900), ("a/2", 1000)] and "the whole cable jumps" in told[0]
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_rounded_keypoints_that_rest_with_the_grippers_are_kept(moves):
+    angles = np.concatenate([np.linspace(0.6, 1.2, 100), np.full(30, 1.2), np.linspace(1.2, 0.6, 100)])
+    right = arch_take(np.linspace(0.0, 1.0, 13), angles)
+    pose = right.gripper_pose + 1e-5 * np.random.default_rng(1).standard_normal(right.gripper_pose.shape)
+    if moves:
+        pose[100:130, 0, 1] += 0.1 * np.linspace(0.0, 1.0, 30)
+    parts, told = cut_at_gaps(
+        (dataclasses.replace(right, keypoints=right.keypoints.round(3), gripper_pose=pose),), None
+    )
+    assert samples_of(parts) == ([("a/1", 100), ("a/2", 99)] if moves else [("a", 230)])
+    assert len(told) == (2 if moves else 0)
+
+
+@pytest.mark.parametrize(("length", "count", "noise"), [(0.2, 41, 5e-4), (1.0, 101, 2e-3), (1.0, 13, 5e-3)])
+def test_noise_does_not_lengthen_the_measured_cable(length, count, noise):
+    marks = np.linspace(0.0, length, count)
+    one = arch_take(marks, np.linspace(0.5, 1.2, 400), noise=noise)
+    np.testing.assert_allclose(measured_arclength((one,))[-1], length, rtol=4e-3)

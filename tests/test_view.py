@@ -198,3 +198,10 @@ def test_only_the_first_shard_of_a_data_set_is_read(tmp_path, capsys, monkeypatc
     monkeypatch.setattr(Store, "read_shard", lambda self, shard: (read.append(shard), whole(self, shard))[1])
     view(capsys, store.path)
     assert read == [0]
+
+
+def test_a_log_with_a_target_in_which_nothing_was_observed(tmp_path, capsys):
+    log = planar()
+    log = dataclasses.replace(log, keypoints=np.full_like(log.keypoints, np.nan))
+    _, page = view(capsys, write_gap_log(tmp_path / "log.npz", log))
+    assert "not seen to not seen" in page and "nan to" not in page

@@ -185,10 +185,13 @@ def config_of_log(log: GapLog, *, n_links: int | None = None, timestep: float | 
 def cable_of_log(log: GapLog) -> Cable:
     """The cable that a log states, with its own diameter, marks and grasp.
 
+    A log may state the first and last keypoint near the ends, for example rounded; a cable has them at the ends.
+
     Raises:
         ValueError: it is not one that a simulator can take.
     """
-    cable, marks = log.meta["cable"], np.asarray(log.meta["keypoint_arclength_m"], float)
+    cable, marks = log.meta["cable"], np.array(log.meta["keypoint_arclength_m"], float)
+    marks[[0, -1]] = 0.0, cable["length_m"]
     uniform = np.allclose(marks, np.linspace(0.0, cable["length_m"], len(marks)), rtol=0, atol=1e-6 * cable["length_m"])
     return dataclasses.replace(
         config_of_log(log).cable,

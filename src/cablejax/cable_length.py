@@ -40,7 +40,7 @@ def require_fitting_length(
     usual = stated.copy()
     usual[seen] = np.nanmedian(chords[:, seen], axis=0)
     # noise across a chord lengthens it
-    noise = _noise(episodes)
+    noise = coordinate_noise(episodes)
     across = (episodes[0].shape[-1] - 1) * noise**2 / np.maximum(stated, 1e-9)
     excess = np.concatenate([[0.0], np.cumsum(usual - stated - across)])
     low = np.minimum.accumulate(excess)
@@ -52,7 +52,7 @@ def require_fitting_length(
             f"{name} gives them {stated[begin:end].sum():.4g} m of cable, and a cable does not stretch so far (noise "
             f"of {1e3 * noise:.2g} mm is allowed for): correct {name}, or the unit of length."
         )
-    ring = bent_chord(len(arclength))
+    ring = float(ring_chords(stated).sum() / stated.sum())
     if usual.sum() < (ring - BENT) * stated.sum():
         raise ValueError(
             f"Along the keypoints the cable usually measures {usual.sum():.4g} m, but {name} gives it "
@@ -60,19 +60,20 @@ def require_fitting_length(
         )
     whole = chords.sum(axis=1)[np.isfinite(chords).all(axis=1)]
     short, long = np.quantile(whole, [0.05, 0.95]) if len(whole) else (1.0, 1.0)
-    if ring and long > (1 + STRETCH) / ring * short + 2 * len(stated) * noise:
+    if long > (1 + STRETCH) / ring * short + 2 * len(stated) * noise:
         raise ValueError(
             f"Along the keypoints the cable measures {short:.4g} m in some samples and {long:.4g} m in others, and a "
             "cable does not stretch so far: check the camera's scale, and that the markers stay on the cable."
         )
 
 
-def bent_chord(n_keypoints: int) -> float:
-    """Ratio of chord to arc between neighbouring keypoints on a cable bent into a ring."""
-    return max(1 - (2 * np.pi / (n_keypoints - 1)) ** 2 / 24, 0.0)
+def ring_chords(stated: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
+    """Distances between neighbouring keypoints [m] where the cable is bent into a ring, from the arcs between them."""
+    length = float(stated.sum())
+    return length / np.pi * np.sin(np.pi * stated / length)
 
 
-def _noise(episodes: Sequence[Float[np.ndarray, "T N D"]]) -> float:
+def coordinate_noise(episodes: Sequence[Float[np.ndarray, "T N D"]]) -> float:
     """Standard deviation of a coordinate [m], from third differences in time; 0 where there are too few samples."""
     third = np.concatenate([np.diff(points, n=3, axis=0).ravel() for points in episodes])
     third = np.abs(third[np.isfinite(third)])

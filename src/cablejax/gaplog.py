@@ -233,6 +233,8 @@ def read_gap_log(path: str | os.PathLike) -> GapLog:
             if not np.can_cast(fields[name].dtype, dtype, casting="same_kind"):
                 raise GapLogError(f"{path}: field '{name}' has dtype {fields[name].dtype}, expected {np.dtype(dtype)}.")
             arrays[name] = fields[name].astype(dtype)
+            if fields[name].dtype.kind in "iu" and (arrays[name] != fields[name]).any():
+                raise GapLogError(f"{path}: field '{name}' has {fields[name].max()}, too large for {np.dtype(dtype)}.")
     log = GapLog(meta=meta, **arrays)
     try:
         validate(log)
@@ -272,3 +274,18 @@ def targets_of(log: GapLog) -> list[Float[np.ndarray, "N D"] | None]:
         known = points.shape == log.keypoints.shape[2:] and bool((np.abs(points) <= LIMITS["coordinate"].high).all())
         found.append(points if known else None)
     return found
+
+
+def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
+    """Labels of the episodes by the first of these extra fields that the log has; else their numbers.
+
+    Only lists of one text or number for each episode are labels; what another program means by these names is left
+    alone.
+    """
+    for name in names:
+        value = log.meta.get(name)
+        if not isinstance(value, list) or len(value) != len(log.keypoints):
+            continue
+        if all(isinstance(entry, (str, int, float)) for entry in value):
+            return [str(entry) for entry in value]
+    return [str(e) if default is None else default for e in range(len(log.keypoints))]

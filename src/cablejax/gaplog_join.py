@@ -74,7 +74,7 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
                 )
     derived = np.concatenate([commands_derived(log) for log in logs])
     # what one of them guessed of the cable that they share is a guess
-    guessed = list(dict.fromkeys(name for log in logs for name in log.meta.get("guessed", ())))
+    guessed = list(dict.fromkeys(name for log in logs for name in _guessed(log)))
     own_words = {*META_FIELDS, *EPISODE_LABELS, COMMANDS_DERIVED, TARGETS, "guessed", "recordings"}
     targets = [None if target is None else target.tolist() for log in logs for target in targets_of(log)]
     extra = set.intersection(*(set(log.meta) for log in logs)) - own_words
@@ -153,6 +153,12 @@ def _of_one_length(logs: Sequence[GapLog]) -> Sequence[GapLog]:
         )
         for log in logs
     ]
+
+
+def _guessed(log: GapLog) -> list[Any]:
+    """Names of the cable's values that were guessed; another program may mean something else by this field."""
+    names = log.meta.get("guessed")
+    return names if isinstance(names, list) else []
 
 
 def _labels(logs: Sequence[GapLog], names: Sequence[str], field: str) -> list[Any] | None:

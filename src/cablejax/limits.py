@@ -84,7 +84,7 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         "learning_rate": Limit(1e-12, 1.0),
         # a recording
         "recorded_length": Limit(0.05, 20.0, "m"),
-        "sample_interval": Limit(1e-4, 1.0, "s"),
+        "sample_interval": Limit(1e-4, 1.1, "s"),
         "reading": Limit(0.0, 1e7, "in the unit of the recording"),
         "coordinate": Limit(0.0, 1e4, "m or rad"),
         "speed": Limit(0.0, 1e3, "m/s or rad/s"),

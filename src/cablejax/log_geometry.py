@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cablejax.arrays import stretches
-from cablejax.cable_length import BENT, bent_chord
+from cablejax.cable_length import BENT, ring_chords
 from cablejax.types import GapLog
 
 REACH = 5.0
@@ -23,8 +23,8 @@ BESIDE = 0.02
 ASKEW = np.radians(60.0)
 """Median angle between a gripper's tangent and the cable next to it that no clamp has."""
 _FEWEST = 5
-_FEWEST_NEAR = 9
-"""Keypoints from which on the first two show the cable's direction at a gripper."""
+_NEAR = 1 / 8
+"""Distance between an end's two keypoints, in lengths of the cable, up to which they show its direction there."""
 # So many samples without any change, while both neighbours move in most of them, are a tracker's last value.
 _FROZEN, _MOVING = 10, 0.8
 _DEGREES_OFF = 0.5
@@ -151,9 +151,10 @@ def cable_fault(log: GapLog) -> str | None:
             )
             return f"Keypoint {name} is {away:.2f} m from gripper {gripper}, expected it at the gripper: {advice}"
     # chords are shorter than the cable between them, the more so the fewer there are
-    chord = np.linalg.norm(np.diff(points, axis=1), axis=-1) / np.diff(log.meta["keypoint_arclength_m"])
+    stated = np.diff(log.meta["keypoint_arclength_m"])
+    chord = np.linalg.norm(np.diff(points, axis=1), axis=-1) / stated
     ratio = float(np.nanmedian(chord)) if np.isfinite(chord).any() else 1.0
-    if not bent_chord(points.shape[1]) - BENT <= ratio <= 1 + BENT:
+    if not (ring_chords(stated) / stated).min() - BENT <= ratio <= 1 + BENT:
         return (
             f"The keypoints lie {ratio:.2f} times as far apart as meta.keypoint_arclength_m says: correct the length, "
             "the unit, or the marks."
@@ -172,11 +173,10 @@ def setup_fault(log: GapLog) -> str | None:
         return None
     if log.keypoints.shape[-1] == 3:
         return _axis_fault(log)
-    if log.keypoints.shape[2] < _FEWEST_NEAR:
-        return None
+    stated = np.diff(log.meta["keypoint_arclength_m"])
     for gripper in (0, 1):
         angle, direction = _tangents(log, gripper)
-        if not len(angle):
+        if not len(angle) or stated[-gripper] > _NEAR * stated.sum() * (1 + 1e-6):
             continue
         if (times := _turns_less(angle, direction)) > _DEGREES_TURN:
             return (

@@ -18,6 +18,9 @@ from cablejax.limits import LIMITS
 from cablejax.simulate.table_plant import Observation
 from cablejax.types import GapLog
 
+# A pause longer than this [s], and than so many usual intervals, ends an episode.
+_PAUSE, _INTERVALS = 1.0, 3.0
+
 
 def motion(target: Target) -> str:
     """What the grippers do, in the words of a gap log."""
@@ -80,7 +83,7 @@ class RunLog:
         self._commands[-1] = (since, math.inf, np.zeros_like(twist))
 
     def episodes(self, name: str, *, longest_pause: float = math.inf) -> list[tuple[float, Episode]]:
-        """The recording in pieces without a longer pause between samples than that [s], none longer than a log's.
+        """The recording in pieces without a pause between samples longer than `longest_pause` [s], none beyond a log's.
 
         A pose that was not measured is interpolated; a piece without any is left out.
 
@@ -148,7 +151,7 @@ class RunLog:
         )
 
     def gap_log(self, target: Target, cable: Cable, source: str) -> GapLog:
-        """The recording as a gap log; a pause longer than a log's largest sample interval begins another episode.
+        """The recording as a gap log; a pause of more than a second, or three usual intervals, begins another episode.
 
         `meta` has the target of each episode, and the field "robot_link": counts, the time stamps at which episodes
         begin, changes of the status, and the first reasons of refusals.
@@ -156,7 +159,9 @@ class RunLog:
         Raises:
             GapLogError: nothing was recorded, or the recording violates the format.
         """
-        pieces = self.episodes(motion(target), longest_pause=LIMITS["sample_interval"].high)
+        steps = np.diff(sorted(self._samples))
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        pieces = self.episodes(motion(target), longest_pause=max(_PAUSE, _INTERVALS * usual))
         report = {
             "counts": self.counts,
             "starts_s": [start for start, _ in pieces],

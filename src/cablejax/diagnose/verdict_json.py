@@ -267,10 +267,9 @@ def _worth(following: NextMotion) -> dict[str, Any]:
 
 
 def _where(where: Where) -> dict[str, Any]:
-    seen = np.isfinite(where.heat)
     return {
-        "along_cable_mm": np.where(seen.any(axis=(0, 1)), where.along_cable_mm, np.nan),
-        "per_episode_mm": np.where(seen.any(axis=(1, 2)), where.per_episode_mm, np.nan),
+        "along_cable_mm": where.along_cable_mm,
+        "per_episode_mm": where.per_episode_mm,
         "regimes": where.regimes,
         "per_horizon_mm": [
             {"horizon_s": seconds, "gap_mm": size} for seconds, size in sorted(where.horizons_mm.items())

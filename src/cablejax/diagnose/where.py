@@ -118,9 +118,9 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
     where = Where(
         gap_mm=size(True),
         smallest_mm=smallest_gap(noise, 2 * everywhere.sum() / inflation, LEVEL),
-        along_cable_mm=np.nan_to_num(above(squares, noise, (0, 1))),
+        along_cable_mm=above(squares, noise, (0, 1)),
         bend_per_m=_bending(log, residual, noise),
-        per_episode_mm=np.nan_to_num(above(squares, noise, (1, 2))),
+        per_episode_mm=above(squares, noise, (1, 2)),
         episode_p=exceedance_p(squared.reshape(len(squared), -1), inflation),
         keypoint_p=exceedance_p(squared.reshape(-1, squared.shape[-1]).T, inflation),
         heat=np.sqrt(squared),

@@ -42,7 +42,7 @@ def sizes_of(
     where = Where(
         gap_mm=float(above(squares, noise)) if gap_mm is None else gap_mm,
         smallest_mm=smallest_mm,
-        along_cable_mm=np.nan_to_num(above(squares, noise, (0, 1, 3))),
+        along_cable_mm=above(squares, noise, (0, 1, 3)),
         per_episode_mm=above(squares, noise, (1, 2, 3)),
         heat=np.sqrt(mean_of_finite(squares, -1)) / max(noise, 1e-6),
         horizons_mm=dict(horizons_mm),

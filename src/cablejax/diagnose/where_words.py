@@ -84,22 +84,22 @@ def _seen(where: Where) -> list[int]:
 
 
 def _along(where: Where, arclength: np.ndarray) -> list[str]:
-    profile = where.along_cable_mm
+    ends, seen = where.along_cable_mm[[0, -1]], np.isfinite(where.along_cable_mm)
+    profile, marks = where.along_cable_mm[seen], arclength[seen]
     if len(profile) < 4 or profile.max() <= 0:
         return []
     peak = int(np.argmax(profile))
-    ends = profile[[0, -1]]
     if ends.min() > 0.5 * profile.max():
         return [
             f"It reaches the grippers, {ends.min():.1f} mm at the smaller end against {profile.max():.1f} mm at most: "
             "the picture, the arms or the grasps are off, not only the cable between them."
         ]
     near = np.flatnonzero(profile >= 0.5 * profile.max())
-    low, high = arclength[near[0]], arclength[near[-1]]
+    low, high = marks[near[0]], marks[near[-1]]
     outside = np.delete(profile, np.arange(near[0], near[-1] + 1))
     rest = f" against {np.sqrt((outside**2).mean()):.1f} mm elsewhere" if len(outside) else ""
     place = f"between {low:.2f} and {high:.2f} m" if high > low else f"at {low:.2f} m"
-    sentence = f"Along the cable it is largest {place}, {profile[peak]:.1f} mm at {arclength[peak]:.2f} m{rest}."
+    sentence = f"Along the cable it is largest {place}, {profile[peak]:.1f} mm at {marks[peak]:.2f} m{rest}."
     bend = where.bend_per_m
     if bend is not None and bend.max() > 0:
         strong = np.flatnonzero(bend >= 0.7 * bend.max())

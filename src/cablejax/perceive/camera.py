@@ -15,6 +15,8 @@ from cablejax.simulate.composite import link_lengths, node_offsets
 
 CENTRE_DEPTH = np.pi / 4
 """How far behind its visible surface the axis of a cylinder lies on average, seen from the side, in radii."""
+_CLEAR = 2.5
+"""Heights above the table that are taken for cable begin at so many standard deviations of the range at least."""
 MARGIN = 0.01
 """Width [m] around the cable's outline in which rays are cast. All others meet the table, which has a formula."""
 
@@ -33,8 +35,8 @@ class CameraConfig:
         range_noise: standard deviation of the measured range [m].
         dropout: probability that a pixel has no range.
         outliers: probability that a pixel has a range that is uniformly random in the last 5 % before the table.
-        min_height, max_height: what lies between these heights [m] is taken for cable. None: the cable's radius, and
-            three of them above its top.
+        min_height, max_height: what lies between these heights [m] is taken for cable. None: the cable's radius or 2.5
+            times the noise of the range, whichever is larger; and three radii above the cable's top.
         min_neighbours: of the eight pixels around it, how many must be taken for cable too; stray pixels have few.
         gripper_size: box at each gripper (along the cable, across, up) [m], which hides what is behind it. Its own
             points are left out, as a robot does that knows where its arms are.
@@ -88,6 +90,12 @@ class DepthCamera:
     """
 
     def __init__(self, config: CameraConfig, chain: Discretisation):
+        if config.min_height is None and _lowest(config, chain) >= chain.cable.diameter:
+            raise ValueError(
+                f"CameraConfig.range_noise is {1e3 * config.range_noise:g} mm, in which a cable of "
+                f"{1e3 * chain.cable.diameter:g} mm does not stand out from the table: expected less than "
+                f"{1e3 * chain.cable.diameter / _CLEAR:.2g} mm, or a min_height."
+            )
         self.config, self.chain = config, chain
         self.position, self._rays = _pixels(config)
         self.model = _scene(config, chain)
@@ -122,7 +130,7 @@ class DepthCamera:
         config, random = self.config, self._random
         self._place(nodes, directions, gripper_pose)
         radius = 0.5 * self.chain.cable.diameter
-        low = radius if config.min_height is None else config.min_height
+        low = _lowest(config, self.chain) if config.min_height is None else config.min_height
         high = self.chain.cable.diameter + 3.0 * radius if config.max_height is None else config.max_height
         # Where there is only table the range has a formula; noise and outliers make cable out of few of its pixels.
         rays = self._rays
@@ -195,6 +203,11 @@ class DepthCamera:
                 self.model, self._data, self.position, rays.ravel(), None, True, -1, geom, distance, None, count, 1e3
             )
         return geom, distance
+
+
+def _lowest(config: CameraConfig, chain: Discretisation) -> float:
+    """Height [m] above which a point is taken for cable, where the configuration states none."""
+    return max(0.5 * chain.cable.diameter, _CLEAR * config.range_noise)
 
 
 def _axes(config: CameraConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from cablejax.cable import Cable
-from cablejax.cable_length import require_fitting_length
+from cablejax.cable_length import coordinate_noise, require_fitting_length
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.log_geometry import setup_fault
@@ -131,7 +131,7 @@ def measured_arclength(takes: Sequence[Take]) -> Float[np.ndarray, " N"]:
 
     A cubic spline in the usual distance along the keypoints. It undoes what a straight line from one keypoint to the
     next cuts short, about `(kappa h)^2 / 24` of a spacing h at curvature kappa: a hundredth of the length where markers
-    are 0.1 m apart on a bend of 0.2 m radius.
+    are 0.1 m apart on a bend of 0.2 m radius. What noise adds to the curve's length is subtracted.
     """
     usual = typical_spacing(tuple(takes))
     knots = np.concatenate([[0.0], np.cumsum(usual)])
@@ -142,6 +142,11 @@ def measured_arclength(takes: Sequence[Take]) -> Float[np.ndarray, " N"]:
     points = points[:: max(1, len(points) // _MOST_SAMPLES)]
     pieces = [np.linspace(a, b, _PER_SEGMENT, endpoint=False) for a, b in itertools.pairwise(knots)]
     fine = np.concatenate([*pieces, knots[-1:]])
-    curve = CubicSpline(knots, points, axis=1)(fine)
-    steps = np.linalg.norm(np.diff(curve, axis=1), axis=-1).reshape(len(points), len(usual), _PER_SEGMENT)
-    return np.concatenate([[0.0], np.cumsum(np.median(steps.sum(axis=-1), axis=0))])
+    # steps along the curve, linear in the keypoints
+    weights = np.diff(CubicSpline(knots, np.eye(len(knots)))(fine), axis=0)
+    steps = np.linalg.norm(np.einsum("fn,tnd->tfd", weights, points), axis=-1)
+    # noise across a step lengthens it
+    variance = coordinate_noise([take.keypoints for take in takes]) ** 2 * (weights**2).sum(axis=1)
+    steps -= 0.5 * (points.shape[-1] - 1) * variance / np.diff(fine)
+    arcs = steps.reshape(len(points), len(usual), _PER_SEGMENT).sum(axis=-1)
+    return np.concatenate([[0.0], np.cumsum(np.median(arcs, axis=0))])

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from cablejax.limits import require
 from cablejax.poses import poses_at, without_misreadings
 from cablejax.recordings.assemble import gap_log_from_takes
-from cablejax.recordings.gaps import FILLED
 from cablejax.recordings.layout import Fields, Layout, read_layout
 from cablejax.recordings.mcap_log import MAGIC
 from cablejax.recordings.prepare import prepare
@@ -26,11 +25,8 @@ from cablejax.types import GapLog
 POSE_ARRAY, POSE_STAMPED = "geometry_msgs/msg/PoseArray", "geometry_msgs/msg/PoseStamped"
 """ROS types of the keypoints and of a gripper."""
 
-LARGEST_LAG = 0.05
-"""Farthest from a sample of the keypoints [s] that the poses of a gripper on both sides of it may be."""
-
-SLOWEST = LARGEST_LAG + FILLED / 2
-"""Usual time between a gripper's poses [s] from which on too little is known of its motion in between."""
+SLOWEST = 0.075
+"""Time between a gripper's poses [s] from which on too little is known of its motion in between."""
 
 
 class BagError(ValueError):
@@ -185,7 +181,7 @@ def _at(time: np.ndarray, stamps: np.ndarray, poses: Float[np.ndarray, "S 7"]) -
     """Poses at other times, shape [T, 7], see `poses_at`; NaN in gaps, before the first and after the last."""
     track = poses_at(time, stamps, poses)
     after = np.clip(np.searchsorted(stamps, time), 1, len(stamps) - 1)
-    far = (stamps[after] - time > LARGEST_LAG) | (time - stamps[after - 1] > LARGEST_LAG)
+    far = stamps[after] - stamps[after - 1] > SLOWEST
     outside = (time < stamps[0]) | (time > stamps[-1])
     track[outside | (far & ~np.isin(time, stamps))] = np.nan
     return track

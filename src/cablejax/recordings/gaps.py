@@ -14,8 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cablejax.arrays import positions_at, stretches
+from cablejax.cable_length import coordinate_noise
+from cablejax.log_geometry import MOVED
 from cablejax.poses import poses_at, without_misreadings
-from cablejax.recordings.take import Take, median_step
+from cablejax.recordings.take import Take, median_step, spacing
 
 FILLED = 0.05
 """Longest gap [s] in the grippers' poses that is interpolated linearly."""
@@ -29,8 +31,9 @@ SHORTEST_SAMPLES, SHORTEST = 10, 0.5
 JUMP_ACCELERATION = 100.0
 """Acceleration [m/s^2] of the middle keypoint that is no motion: ten times that of gravity."""
 
-JUMP_RATIO = 2.5
-"""Such a step must also be so many times its neighbours: this separates lost samples from a hard stop."""
+JUMP_RATIO, JUMP_NOISE = 2.5, 6.0
+"""Such a step must also be so many times its neighbours, which separates lost samples from a hard stop, and so many
+times the noise of a coordinate."""
 
 # Repeated samples: so many in a row are a hold of the last value, if no more than this part of all steps are repeats.
 _HELD_SAMPLES, _HELD_PART = 3, 0.2
@@ -134,7 +137,10 @@ def _known(take: Take, on_grippers: tuple[int, ...] | None) -> np.ndarray:
 
 
 def _without_repeats(take: Take, reports: list[str]) -> Take:
-    """The take without the samples in which a tracker holds its last values."""
+    """The take without the samples in which a tracker holds its last values.
+
+    Rounded keypoints of a cable that rests repeat too: samples in which both grippers rest are kept.
+    """
     one, other, hidden = take.keypoints[1:], take.keypoints[:-1], np.isnan(take.keypoints)
     same = ((one == other) | (hidden[1:] & hidden[:-1])).all(axis=(1, 2)) & ~hidden[1:].all(axis=(1, 2))
     if not same.any():
@@ -151,8 +157,9 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
     if same.mean() > _HELD_PART:
         return take
     repeated = np.zeros(len(take.time), bool)
+    length = float(np.median(np.nansum(spacing(take.keypoints), axis=1)))
     for a, b in stretches(same):
-        if b - a >= _HELD_SAMPLES:
+        if b - a >= _HELD_SAMPLES and _moves(take, a, b, MOVED * length):
             repeated[a + 1 : b + 1] = True
     if not repeated.any():
         return take
@@ -167,6 +174,15 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
     if pose is None:
         return dataclasses.replace(take, keypoints=points)
     return dataclasses.replace(take, time=take.time[keep], keypoints=take.keypoints[keep], gripper_pose=pose[keep])
+
+
+def _moves(take: Take, first: int, last: int, distance: float) -> bool:
+    """Whether a gripper moves by more than a distance [m] between two samples, or no poses were measured."""
+    if take.gripper_pose is None:
+        return True
+    place = take.gripper_pose[first : last + 1, :, : take.keypoints.shape[2]]
+    seen = np.isfinite(place).all(axis=(1, 2))
+    return bool(seen.any() and np.linalg.norm(np.ptp(place[seen], axis=0), axis=-1).max() > distance)
 
 
 def _slower(same: Bool[np.ndarray, " S"]) -> int:
@@ -229,7 +245,8 @@ def _breaks(take: Take) -> tuple[list[int], list[str]]:
             "take was cut there."
         )
     # a stamp that is late makes the next interval short, and no jump
-    for t in _jumps(median_step(take.keypoints), np.maximum(interval, usual)):
+    least = JUMP_NOISE * coordinate_noise([take.keypoints])
+    for t in _jumps(median_step(take.keypoints), np.maximum(interval, usual), least):
         breaks.append(t + 1)
         reports.append(
             f"Take {take.name}: the whole cable jumps between samples {t} and {t + 1}, so samples are missing that the "
@@ -238,9 +255,9 @@ def _breaks(take: Take) -> tuple[list[int], list[str]]:
     return breaks, reports
 
 
-def _jumps(step: Float[np.ndarray, " S"], interval: Float[np.ndarray, " S"]) -> list[int]:
+def _jumps(step: Float[np.ndarray, " S"], interval: Float[np.ndarray, " S"], least: float) -> list[int]:
     speed = np.nan_to_num(step / interval)
     neighbour = np.maximum(np.append(speed[1:], 0.0), np.append(0.0, speed[:-1]))
     acceleration = (speed - neighbour) / interval
-    found = (acceleration > JUMP_ACCELERATION) & (speed > JUMP_RATIO * neighbour)
+    found = (acceleration > JUMP_ACCELERATION) & (speed > JUMP_RATIO * neighbour) & (step > least)
     return np.flatnonzero(found).tolist()

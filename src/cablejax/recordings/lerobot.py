@@ -69,7 +69,8 @@ def write_lerobot(folder: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
         _write_tasks(arrow, draft / "meta/tasks.parquet", tasks)
         write_json(draft / "meta/info.json", _info(log, _features(columns, log), len(columns["index"]), len(tasks)))
         write_json(draft / "meta/stats.json", {name: _statistics(column) for name, column in columns.items()})
-        write_json(draft / _LOG, log.meta)
+        # fields of other programs may hold NaN
+        (draft / _LOG).write_text(json.dumps(log.meta, indent=2) + "\n")
         draft.rename(folder)
     return folder
 

@@ -30,6 +30,9 @@ _BREAK, _TOUCHES, _BETWEEN = 2.0, 1.6, 1.15
 number, and it does not lie between that one and a neighbour: the way by it is longer by more than the third factor."""
 _MOSTLY = 0.95
 
+_FEWEST = 4
+"""With fewer distances between keypoints an ordinary arch turns as far at one of them as a cable that folds back."""
+
 _DETOUR, _LOOKED_AT = 0.1, 500
 """By this part of the usual spacing a way is shorter, and not by noise; and samples that are looked at."""
 
@@ -57,6 +60,8 @@ def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
             "Only a cable without branches is simulated. To diagnose the parent alone, give keypoints 0 to "
             f"{parent - 1} and leave out {parent} to {branches[-1][1]}; its mass then lacks that of the branches."
         )
+    if len(usual) < _FEWEST:
+        return takes, []
     folded = np.concatenate([take.keypoints[_worst_turn(take.keypoints) < FOLDED] for take in takes])
     if len(folded) > 0.5 * sum(len(take.time) for take in takes) and _detours(folded) > 0.5:
         share = len(folded) / sum(len(take.time) for take in takes)

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
+from cablejax.cable_length import ring_chords
 from cablejax.poses import poses_from_markers, twists
 from cablejax.recordings.frames import (
     Frame,
@@ -34,7 +35,8 @@ _NAMED = 20
 
 _OTHER_CABLE, _DIFFERS, _LEAST = 0.05, 0.02, 3
 """Takes are of two cables if the logarithms of their spacings differ by the first number (root mean square), and at
-least the third number of them by the second: bending moves them by 0.01 to 0.03, a marker that slipped moves two."""
+least the third number of them by the second: bending moves them by 0.01 to 0.03, a marker that slipped moves two. Few
+keypoints, which are far apart, may differ by twice as much as bending the cable into a ring makes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,9 +136,13 @@ def _require_one_cable(takes: tuple[Take, ...], setup: Setup) -> None:
         seen = np.isfinite(distances).any(axis=0)
         row[seen] = np.log(np.nanmedian(distances[:, seen], axis=0))
 
+    usually = typical_spacing(takes)
+    bent = -2 * np.log(ring_chords(usually) / usually)[ends:-ends]
+
     def apart(one: np.ndarray, other: np.ndarray) -> float:
-        off = (one - other)[np.isfinite(one - other)]
-        differ = len(off) and (np.abs(off) > _DIFFERS).sum() >= _LEAST
+        seen = np.isfinite(one - other)
+        off, least = (one - other)[seen], np.maximum(bent[seen], _DIFFERS)
+        differ = len(off) and (np.abs(off) > least).sum() >= _LEAST
         return float(np.sqrt((off**2).mean())) if differ else 0.0
 
     # condensed, as pdist makes it

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.cable_length import STRETCH
+from cablejax.cable_length import STRETCH, ring_chords
 from cablejax.log_geometry import frozen
 from cablejax.recordings.take import Take, spacing, typical_spacing
 
@@ -83,12 +83,14 @@ def _without(
 
 def without_stretched(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
     """Leaves out a few takes in which the keypoints are farther apart than the cable is long."""
-    usual = float(typical_spacing(takes).sum())
-    kept, reports = [], []
+    spacings, kept, reports = typical_spacing(takes), [], []
+    usual = float(spacings.sum())
+    # chords grow where a bent cable is pulled straight
+    longest_usual = (1 + STRETCH) * usual**2 / float(ring_chords(spacings).sum())
     for take in takes:
         whole = spacing(take.keypoints).sum(axis=1)
         longest = float(np.nanquantile(whole, 0.95)) if np.isfinite(whole).any() else 0.0
-        if longest <= (1 + STRETCH) * usual:
+        if longest <= longest_usual:
             kept.append(take)
             continue
         reports.append(

@@ -84,7 +84,8 @@ def _takes(path: pathlib.Path, how: Layout) -> tuple[tuple[Take, ...], list[str]
     fields.nothing_left()
     episodes = ["1"] * len(time) if episode is None else _column(table, episode)
     motions = ["recorded"] * len(time) if motion is None else _column(table, motion)
-    edges = [0, *(t for t in range(1, len(time)) if episodes[t] != episodes[t - 1]), len(time)]
+    named = list(zip(episodes, motions, strict=True))
+    edges = [0, *(t for t in range(1, len(time)) if named[t] != named[t - 1]), len(time)]
     takes = []
     for a, b in itertools.pairwise(edges):
         if b - a < 2:

@@ -101,7 +101,7 @@ def where_figure(diagnosis: CableDiagnosis) -> Figure:
         episodes = np.sort(np.argsort(-where.per_episode_mm)[:_MAX_EPISODES])
     columns = min(3, len(episodes))
     rows = -(-len(episodes) // columns)
-    smooth = [_smoothed(diagnosis, int(e)) for e in episodes]
+    smooth, rows_at = [_smoothed(diagnosis, int(e)) for e in episodes], _edges(arclength)
     top = max(4.0, float(np.nanpercentile(np.concatenate([s.ravel() for s in smooth]), 99)))
     with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.0, 1.5 + 1.55 * rows), layout="constrained")
@@ -111,15 +111,11 @@ def where_figure(diagnosis: CableDiagnosis) -> Figure:
         for index, (e, values) in enumerate(zip(episodes, smooth, strict=True)):
             ax = figure.add_subplot(grid[1 + index // columns, index % columns])
             panels.append(ax)
-            end = float(log.time[e, log.episode_length[e] - 1])
-            half = 0.5 * float(np.median(np.diff(arclength)))
-            extent = (0.0, end, arclength[0] - half, arclength[-1] + half)
-            image = ax.imshow(
-                values.T, cmap=_HEAT, vmin=0.0, vmax=top, aspect="auto", origin="lower", extent=extent,
-                interpolation="nearest",
-            )  # fmt: skip
-            _mark_holds(ax, diagnosis, int(e), arclength[-1] + half)
-            ax.set_title(f"Episode {e}: {where.per_episode_mm[e]:.1f} mm", fontsize=10)
+            time = _edges(log.time[e, : log.episode_length[e]].astype(float))
+            image = ax.pcolormesh(time, rows_at, values.T, cmap=_HEAT, vmin=0.0, vmax=top, rasterized=True)
+            _mark_holds(ax, diagnosis, int(e), rows_at[-1])
+            size = where.per_episode_mm[e]
+            ax.set_title(f"Episode {e}: {f'{size:.1f} mm' if np.isfinite(size) else 'not observed'}", fontsize=10)
             ax.tick_params(labelleft=index % columns == 0)
             if index % columns == 0:
                 ax.set_ylabel("along\ncable [m]", fontsize=9)
@@ -129,6 +125,13 @@ def where_figure(diagnosis: CableDiagnosis) -> Figure:
             colours = figure.colorbar(image, ax=panels, shrink=0.8, pad=0.01)
             colours.set_label("gap / noise", fontsize=9)
     return figure
+
+
+def _edges(places: np.ndarray) -> np.ndarray:
+    """Edges of cells about places that increase, halfway between them."""
+    between = 0.5 * (places[1:] + places[:-1])
+    first, last = (0.5 * np.diff(places)[[0, -1]]) if len(places) > 1 else (0.5, 0.5)
+    return np.concatenate([[places[0] - first], between, [places[-1] + last]])
 
 
 def _interval(diagnosis: CableDiagnosis, episode: int) -> float:
@@ -155,13 +158,14 @@ def _strip(ax: Axes, diagnosis: CableDiagnosis, arclength: np.ndarray) -> None:
     """The cable laid straight, coloured by the gap, with its numbers and the places of the named effects."""
     profile = diagnosis.where.along_cable_mm
     along = np.linspace(arclength[0], arclength[-1], 400)
-    smooth = np.interp(along, arclength, profile)
-    top = max(float(profile.max()), float(diagnosis.noise_mm.mean()))
+    seen = np.isfinite(profile)
+    smooth = np.interp(along, arclength[seen], profile[seen])
+    top = max(float(profile[seen].max()), float(diagnosis.noise_mm.mean()))
     ax.imshow(
         smooth[None], cmap=_HEAT, vmin=0.0, vmax=top, aspect="auto", extent=(arclength[0], arclength[-1], 0.0, 1.0)
     )
     ax.add_patch(Rectangle((arclength[0], 0), arclength[-1] - arclength[0], 1, fill=False, ec=LIGHT.muted, lw=1))
-    for s, value in zip(arclength, profile, strict=True):
+    for s, value in zip(arclength[seen], profile[seen], strict=True):
         ax.text(s, 1.12, f"{value:.1f}", ha="center", va="bottom", fontsize=9, color=LIGHT.muted)
     for effect in diagnosis.effects:
         for low, high in _sections(effect, arclength):

@@ -237,7 +237,7 @@ def _least(diagnosis: CableDiagnosis) -> float:
 
 def _peak(diagnosis: CableDiagnosis) -> str:
     profile = diagnosis.where.along_cable_mm
-    peak = int(profile.argmax())
+    peak = int(np.nanargmax(profile))
     return f"the gap peaks at {diagnosis.log.meta['keypoint_arclength_m'][peak]:.2f} m, {millimetres(profile[peak])}"
 
 

@@ -9,6 +9,8 @@ from typing import Any
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect
 from cablejax.diagnose.judgement import effect_title, listed, share
 
+_DECIMALS = 6
+
 EFFECTS: dict[str, str] = {
     "bending_stiffness": "the bending stiffness differs everywhere by one factor",
     "stiffness_profile": "the bending stiffness differs over part of the cable",
@@ -95,7 +97,8 @@ def parameter_title(name: str) -> str:
 def quantity(value: Any, unit: str, ci90: Any = None, *, interval: bool = True) -> str:
     """A value with its interval and unit, to the digits that the interval supports: "9.3 mm (8.7 to 10.0)".
 
-    Lengths below 5 cm come in millimetres. Lists are joined. With `interval` false it is not shown.
+    Lengths below 5 cm come in millimetres; a number that needs more than six decimals has an exponent. Lists are
+    joined. With `interval` false the interval is left out.
     """
     if isinstance(value, (list, tuple)):
         intervals: Sequence[Any] = [None] * len(value) if ci90 is None else ci90
@@ -110,8 +113,9 @@ def quantity(value: Any, unit: str, ci90: Any = None, *, interval: bool = True) 
         scale, shown = 1e3, "mm"
     numbers = [scale * x for x in (value, *ends)]
     digits = _digits(numbers)
-    text = f"{numbers[0]:.{digits}f} {shown}".strip()
-    return f"{text} ({numbers[1]:.{digits}f} to {numbers[2]:.{digits}f})" if ends and interval else text
+    value, *ends = (f"{number:.{digits}f}" if digits <= _DECIMALS else f"{number:.3g}" for number in numbers)
+    text = f"{value} {shown}".strip()
+    return f"{text} ({ends[0]} to {ends[1]})" if ends and interval else text
 
 
 def millimetres(value: float) -> str:
@@ -168,7 +172,7 @@ def _digits(numbers: Sequence[float]) -> int:
     """Decimals that show an interval to a few per cent of its width, or a value to three digits."""
     size = 0.25 * abs(numbers[-1] - numbers[1]) if len(numbers) > 2 else 0.0
     size = size or 0.01 * abs(numbers[0])
-    return int(min(max(math.ceil(-math.log10(size)), 0), 6)) if size > 0 else 1
+    return max(math.ceil(-math.log10(size)), 0) if size > 0 else 1
 
 
 def explained_label(diagnosis: CableDiagnosis) -> str:

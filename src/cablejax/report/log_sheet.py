@@ -105,13 +105,17 @@ def _table(episodes: Sequence[Episode], targets: Sequence[np.ndarray | None]):
                 f"{len(episode.time)}",
                 f"{100 * seen.mean():.4g} %",
                 f"{_speed(episode).max(initial=0.0):.3g}",
-                "" if error is None else f"{error[0]:.2f} to {error[-1]:.2f}",
+                "" if error is None else f"{_centimetres(error[0])} to {_centimetres(error[-1])}",
             )
         )
     heading = "Episodes" if len(rows) <= _LISTED else f"The first {_LISTED} of {len(rows)} episodes"
     head = ("episode", "seconds", "samples", "observed", "fastest gripper [cm/s]", "distance to the target [cm]")
     stated = any(target is not None for target in targets)
     return heading, head[: None if stated else -1], [row[: None if stated else -1] for row in rows[:_LISTED]]
+
+
+def _centimetres(error: float) -> str:
+    return f"{error:.2f}" if np.isfinite(error) else "not seen"
 
 
 def _speed(episode: Episode) -> np.ndarray:
@@ -172,7 +176,8 @@ def _time_figure(episodes: Sequence[tuple[Episode, np.ndarray | None]]) -> Figur
         axes[0].set_ylabel("gripper [cm/s]")
         axes[0].set_ylim(bottom=0.0)
         if stated:
-            axes[1].set(ylabel="to the target [cm]", yscale="log")
+            drawn = np.concatenate([line.get_ydata() for line in axes[1].lines])
+            axes[1].set(ylabel="to the target [cm]", yscale="log" if (drawn > 0).any() else "linear")
         axes[-1].set_xlabel("time [s]")
         figure.legend(loc="outside upper left", ncols=3, handlelength=1.6)
     return figure

@@ -11,17 +11,13 @@ from matplotlib.figure import Figure
 
 from cablejax.arrays import mean_of_finite
 from cablejax.diagnose.diagnosis import CableDiagnosis
+from cablejax.gaplog import labels
 from cablejax.report.effect_words import explained_label
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 
 _FRAME = 0.04  # [s] between two pictures of the player
 _SHOWN = 4
 _LOST = 0.5  # [m]
-
-
-def _names(diagnosis: CableDiagnosis) -> list[str]:
-    meta = diagnosis.log.meta
-    return [str(n) for n in meta.get("file", meta.get("take", range(len(diagnosis.log.episode_length))))]
 
 
 def recording_ends(diagnosis: CableDiagnosis, episodes: np.ndarray) -> np.ndarray:
@@ -46,7 +42,7 @@ def files_figure(diagnosis: CableDiagnosis) -> Figure:
         maps = [1e3 * np.sqrt(mean_of_finite(np.minimum(one, 1.0) ** 2, (1, 3))) for one in off]
         used = np.flatnonzero(np.isfinite(maps[0]).any(axis=1))
         top = float(np.nanpercentile(maps[0], 95))
-        names = _names(diagnosis)
+        names = labels(diagnosis.log, "file", "take")
         image = None
         for ax, (label, _), error in zip(panels, parts, maps, strict=True):
             image = ax.imshow(error[used].T, aspect="auto", origin="lower", cmap="cividis", vmin=0, vmax=top)
@@ -89,7 +85,7 @@ def cable_still(diagnosis: CableDiagnosis) -> Figure:
 
 def orbit_data(diagnosis: CableDiagnosis) -> dict[str, Any]:
     """Data of the player: the files with the largest, the smallest and middling gaps, in whole millimetres."""
-    log, names = diagnosis.log, _names(diagnosis)
+    log, names = diagnosis.log, labels(diagnosis.log, "file", "take")
     size = np.asarray(diagnosis.where.per_episode_mm, float)
     used = np.flatnonzero(np.isfinite(size))
     order = used[np.argsort(-size[used])]

@@ -17,8 +17,9 @@ from cablejax.diagnose.noise import noise_floor
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.where import HORIZONS, Where, above
 from cablejax.diagnose.where_sizes import sizes_of
+from cablejax.gaplog import labels
 from cablejax.spatial.cable import MORE_EDGES, SpatialCable, bounded
-from cablejax.spatial.windows import Windows, labels
+from cablejax.spatial.windows import Windows
 from cablejax.types import GapLog
 
 RESOLVABLE = 3.0

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.spatial.windows import labels
+from cablejax.gaplog import labels
 from cablejax.types import GapLog
 
 _SCATTERS = 6.0

@@ -12,6 +12,7 @@ from cablejax.cable import GRAVITY
 from cablejax.cable_length import TOLERANCE, require_fitting_length
 from cablejax.diagnose.log_faults import steadied
 from cablejax.diagnose.noise import noise_floor
+from cablejax.gaplog import labels
 from cablejax.log_geometry import cable_fault
 from cablejax.poses import rotated
 from cablejax.spatial.clock import steps_of
@@ -218,21 +219,6 @@ def _pieces(
             else:
                 left_out.append((e, begin))
     return pieces, left_out
-
-
-def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
-    """Labels of the episodes by the first of these extra fields that the log has; else their numbers.
-
-    Only lists of one text or number for each episode are labels; what another program means by these names is left
-    alone.
-    """
-    for name in names:
-        value = log.meta.get(name)
-        if not isinstance(value, list) or len(value) != len(log.keypoints):
-            continue
-        if all(isinstance(entry, (str, int, float)) for entry in value):
-            return [str(entry) for entry in value]
-    return [str(e) if default is None else default for e in range(len(log.keypoints))]
 
 
 def _sample_interval(log: GapLog) -> float:

@@ -122,18 +122,23 @@
     if (playing) requestAnimationFrame(tick);
   }
 
+  // the slider stops at its last whole step
+  function atEnd() {
+    return Number(slider.value) > data.end - Number(slider.step);
+  }
+
   function tick(now) {
     if (!playing) return;
     const passed = last === null ? 0 : (now - last) / 1000;
     last = now;
     slider.value = Math.min(data.end, Number(slider.value) + SPEED * passed);
     draw();
-    if (Number(slider.value) >= data.end) setPlaying(false);
+    if (atEnd()) setPlaying(false);
     else requestAnimationFrame(tick);
   }
 
   button.addEventListener("click", () => {
-    if (!playing && Number(slider.value) >= data.end) slider.value = 0;
+    if (!playing && atEnd()) slider.value = 0;
     setPlaying(!playing);
     draw();
   });
