@@ -222,6 +222,6 @@ def test_what_the_arms_alone_explain_has_draws_too():
 def test_that_the_cable_may_have_no_effect_is_said_beside_the_arms():
     cable = (EffectValues("bending_stiffness", {"ratio": 2.0}),)
     found = dataclasses.replace(NOTHING, verdict="named", posterior=(cable,) * 12 + ((),) * 4, nothing=0.25)
-    assert "With a probability of 25 % it is no effect" in sentence(
+    assert "With a probability of 25 % there is no effect" in sentence(
         with_arms(found, told(gain=1.08), Calibration()), 0.8
     )

@@ -64,9 +64,9 @@ def holed(log: GapLog, share: float) -> GapLog:
 @pytest.mark.parametrize(
     "effect", [pytest.param((OFFSET,), marks=pytest.mark.slow, id="effect"), pytest.param((), id="none")]
 )
-def test_one_episode_is_told_to_be_little(effect):
+def test_one_episode_is_reported_as_a_limit(effect):
     result = told(episodes(record(*effect), [0]))
-    assert caveat(result, "One episode only") and not_misled(result, NAME)
+    assert caveat(result, "The log has one episode") and not_misled(result, NAME)
     assert (result.verdict == "none") == (effect == ())
 
 

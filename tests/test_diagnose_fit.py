@@ -319,7 +319,7 @@ def test_the_headline_lists_no_cause_whose_probability_is_below_one_per_cent():
     assert conclusion.verdict == "ambiguous" and conclusion.ranking[1].probability < 0.01
     words = sentence(conclusion, 0.9)
     assert words.startswith("The gap comes from bending stiffness.")
-    assert "Table friction would leave as little, at a probability below 1 %." in words
+    assert "Table friction would leave as little of the gap, but with a probability below 1 %." in words
     (named,) = conclusion.effects
     assert named.alike["table_friction"] < 0.01
     even = dataclasses.replace(conclusion, effects=(dataclasses.replace(named, alike=dict.fromkeys(named.alike, 0.5)),))

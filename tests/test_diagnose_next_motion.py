@@ -161,7 +161,7 @@ def test_nothing_is_left_to_find_out_without_parameters():
 
 def test_bounds_that_exclude_every_motion_say_which_and_how_many():
     judge = judge_of(one("axial_stretch", 20.0), bounds=Bounds(workspace=((5.0, 5.0), (6.0, 6.0))))
-    with pytest.raises(BoundsError, match=r"of 6 that were tried, workspace excludes 6\. Relax the first"):
+    with pytest.raises(BoundsError, match=r"of the 6 motions tried, workspace excludes 6\. Relax the first"):
         next_motion(judge)
     with pytest.raises(BoundsError, match="workspace excludes"):
         require_some_motion(log_motion(), NOISE, judge.bounds)

@@ -223,7 +223,7 @@ def test_caveats_on_holds_that_are_none():
     log = record()
     assert not caveats_of(Case.of(log), Calibration(), None, 0.0, commissioned=True)
     (text, *_) = Case.of(dataclasses.replace(log, hold=np.ones_like(log.hold))).recording.caveats
-    assert re.match(r"\d+ of 400 samples are marked as holds while the grippers move", text)
+    assert re.match(r"\d+ of 400 samples are marked as holds although the grippers move", text)
     creeping = np.array(log.keypoints)
     creeping[:, :, 3:10, 1] += 0.004 * np.sin(0.9 * np.arange(creeping.shape[1]))[None, :, None]
     texts = caveats_of(
@@ -316,7 +316,7 @@ def test_explains_again_where_small_errors_grow_under_the_best_explanation(monke
     assert len(seen) == 3
 
 
-def test_a_motion_that_says_nothing_of_a_gap_is_told():
+def test_a_motion_that_is_no_evidence_of_a_gap_is_reported():
     """By a verdict of "none" only; the other motions count as ever."""
     facts = evidence(noise_mm=0.5)
     own, off = np.full(4, 3.5e-4), np.zeros(4)
@@ -326,9 +326,9 @@ def test_a_motion_that_says_nothing_of_a_gap_is_told():
     none = Conclusion("none", fit, (), (), (), 0.0)
     (text,) = silent_motions(facts, none, Calibration())
     assert text.startswith(
-        "Episode 2 says nothing for or against a gap: the nominal simulator misses the cable by 54 mm"
+        "Episode 2 is no evidence for or against a gap: the nominal simulator misses the cable by 54 mm"
     )
-    assert "may be off by 50 mm without any effect" in text
+    assert "may be off by 50 mm there without any effect" in text
     assert not list(silent_motions(facts, dataclasses.replace(none, verdict="unknown"), Calibration()))
     calm = dataclasses.replace(fit, sse=facts.count * 1.0)
     assert not list(silent_motions(facts, dataclasses.replace(none, best=calm), Calibration()))

@@ -172,7 +172,7 @@ def test_a_simulator_that_ignores_its_explanations_is_refused():
         def predict(self, explanations, episodes):
             return super().predict([explanation() for _ in explanations], episodes)
 
-    with pytest.raises(ValueError, match="Does predict use the explanations"):
+    with pytest.raises(ValueError, match="Does predict use its explanations"):
         diagnose_simulator(Ignoring(), observed_swings(1.3), interval=0.02, noise=1e-4)
 
 

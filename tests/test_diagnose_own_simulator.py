@@ -330,11 +330,11 @@ BAD = {
         None,
         "has to simulate the episodes that it is asked for",
     ),
-    "breaks down": (
+    "diverges": (
         lambda: broken(predict=lambda self, ones, episodes: np.nan * Line.predict(self, ones, episodes)),
         {},
         None,
-        "breaks down",
+        "is not finite in samples that were observed",
     ),
 }
 
@@ -450,7 +450,8 @@ def test_one_episode_shows_a_gap_and_too_little_of_it_to_name_its_cause():
     dear = Calibration(baseline=1e-4, term_cost=12.0)
     found = [diagnose_simulator(swing, true[:n], interval=0.05, noise=1e-3, calibration=dear) for n in (1, 2)]
     assert [one.verdict for one in found] == ["unknown", "named"]
-    assert found[0].sentence.startswith("There is a gap, but too little of it") and "library" not in found[0].sentence
+    sentence = found[0].sentence
+    assert sentence.startswith("There is a gap, but this log shows too little of it") and "library" not in sentence
 
 
 GAIN = Effect(

@@ -44,7 +44,7 @@ def test_a_cable_that_has_settled_is_read_in_one_way():
 def test_a_start_held_by_the_table_is_no_gap():
     found = diagnose(held_log())
     assert found.verdict == "none" and not found.effects
-    assert "if the cable begins as it was first seen, held there by the table" in found.sentence
+    assert "the cable starts in its first observed shape, held there by the table" in found.sentence
     assert found.caveats[0].startswith("At the start, keypoints are up to")
 
 

@@ -62,14 +62,14 @@ def test_one_keypoint_that_is_off_is_found_although_no_episode_stands_out():
     assert "too small to show in any single episode" in where.sentences[0]
 
 
-def test_gap_that_comes_with_motion_is_told_from_one_that_stays():
+def test_gap_that_grows_with_motion_differs_from_one_that_remains():
     motions = (*MOTIONS, *(f"back_{motion}" for motion in MOTIONS))
     pose = np.stack([poses(m) for m in motions])[..., :2]
     velocity = np.gradient(pose, 0.1, axis=1).mean(axis=2)
     moving = localise(*case(0.2 * velocity[:, :, None], motions), np.full(POINTS, NOISE))
     ratio, p = moving.contrasts["speed: hold"]
     assert ratio < 0.5 and p < 0.05
-    assert any("comes with motion" in sentence for sentence in moving.sentences)
+    assert any("grows with motion" in sentence for sentence in moving.sentences)
     staying = localise(*case(4e-3, motions), np.full(POINTS, NOISE))
     assert any("not a lag" in sentence for sentence in staying.sentences)
     assert staying.regimes["speed: hold"] == pytest.approx(4.0, rel=0.1)
@@ -88,7 +88,7 @@ def test_rest_before_any_motion_does_not_make_a_gap_one_of_motion():
     gap[:, 40:] = 4e-3
     where = localise(*case(gap, motions), np.full(POINTS, NOISE))
     assert where.regimes["start: at rest"] < 0.3 and where.regimes["speed: hold"] > 3.5
-    assert not any("comes with motion" in sentence for sentence in where.sentences)
+    assert not any("grows with motion" in sentence for sentence in where.sentences)
 
 
 def test_frames_tell_a_camera_from_marks_on_the_cable():
@@ -177,7 +177,7 @@ def test_correlated_noise_widens_its_sum_of_squares():
     [
         (lambda log, x, s: (log, x[:, :-1], s), "nominal has shape"),
         (lambda log, x, s: (log, x, 0.0 * s), "expected positive"),
-        (lambda log, x, s: (log, np.full_like(x, np.nan), s), "no gap to look at"),
+        (lambda log, x, s: (log, np.full_like(x, np.nan), s), "no gap to locate"),
     ],
     ids=["another length", "no noise", "nothing simulated"],
 )

@@ -106,7 +106,9 @@ class Case:
             try:
                 made = Playback.of_motion(of_links, pose, first, recording.interval, step, believed=believed)
             except ValueError as error:
-                raise DiagnosisError(f"The nominal cable has no settled shape at a first pose: {error}") from error
+                raise DiagnosisError(
+                    f"The nominal cable does not settle at the first gripper poses of an episode: {error}"
+                ) from error
             # the fine cable is replayed once or twice, by a program of its own
             rows = made.rows if n_links == FIT_LINKS else min(made.rows, len(pose))
             return dataclasses.replace(made, length=recording.length, rows=rows, settling=settling)
@@ -117,7 +119,9 @@ class Case:
         playback = replay(FIT_LINKS, LARGEST_STEP, recording.gripper_pose)
         nominal = run(replay(FINE_LINKS, FINE_STEP, recording.gripper_pose))
         if not np.isfinite(nominal).all():
-            raise DiagnosisError("The nominal simulation of this log breaks down: are the poses continuous, in metres?")
+            raise DiagnosisError(
+                "The nominal simulation of this log diverges: are the poses continuous, and in metres?"
+            )
         # roughly [m]: the world's origin wherever the grippers are within a metre of it
         place = _FRAME * np.round(np.nanmean(recording.gripper_pose[..., :2], axis=(0, 1, 2)) / _FRAME)
         simulator = PlanarCable(

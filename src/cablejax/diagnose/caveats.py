@@ -24,9 +24,9 @@ def contradictions(rounds: Rounds | None) -> tuple[str, ...]:
     if rounds is None or not rounds.contradictory:
         return ()
     return (
-        f"The recordings contradict one another: {rounds.odd_one.name} is explained best with other parameters than "
-        f"the rest, as recordings of one set-up would be in fewer than {UNLIKELY:g} of all cases. Check what was "
-        "changed between them, and diagnose each one alone.",
+        f"The recordings contradict one another: the best explanation of {rounds.odd_one.name} has other parameters "
+        f"than that of the rest. Recordings of one set-up differ this much in fewer than {UNLIKELY:g} of all cases. "
+        "Check what was changed between them, and diagnose each one alone.",
     )
 
 
@@ -36,10 +36,10 @@ def silent_motions(evidence: Evidence, conclusion: Conclusion, calibration: Cali
         return
     for episode, gap, own in excused(conclusion.best, evidence, calibration):
         yield (
-            f"Episode {episode} says nothing for or against a gap: the nominal simulator misses the cable by "
-            f"{1e3 * gap:.2g} mm per coordinate there, and may be off by {1e3 * own:.2g} mm without any effect, for "
-            "small errors grow in it, as where a cable snaps over or is wrung by a wrong pose. Look at it, or record a "
-            "calmer motion."
+            f"Episode {episode} is no evidence for or against a gap: the nominal simulator misses the cable by "
+            f"{1e3 * gap:.2g} mm per coordinate, and may be off by {1e3 * own:.2g} mm there without any effect. Small "
+            "errors grow in this motion, for example where the cable snaps over or a wrong pose strains it. Check the "
+            "episode, or record a calmer motion."
         )
 
 
@@ -58,25 +58,25 @@ def caveats_of(
     caveats = list(case.recording.caveats)
     if not commissioned:
         caveats.append(
-            "No commissioning logs were given: the simulator's own error is not separated from the cable's gap; "
-            f"{1e3 * calibration.baseline:.2g} mm of it is assumed."
+            "No commissioning logs were given: the simulator's own error cannot be separated from the gap and is "
+            f"assumed to be {1e3 * calibration.baseline:.2g} mm."
         )
     if stated > Calibration.baseline:
         caveats.append(
-            f"This cable is sensitive to its stated numbers: {100 * STATED:g} % more or less stiffness or friction "
-            f"moves keypoints by {1e3 * stated:.2g} mm per coordinate, and a gap must be larger to count."
+            f"This cable is sensitive to its stated properties: {100 * STATED:g} % more or less stiffness or friction "
+            f"moves keypoints by {1e3 * stated:.2g} mm per coordinate, so only a larger gap counts."
         )
     if case.scatter.any():
         caveats.append(
             f"The measured gripper poses scatter by up to {1e3 * case.scatter[:, :2].max():.2g} mm and "
-            f"{1e3 * case.scatter[:, 2].max():.2g} mrad from one sample to the next. They are smoothed, or they would "
-            "shake the simulated cable."
+            f"{1e3 * case.scatter[:, 2].max():.2g} mrad from one sample to the next. They were smoothed, since this "
+            "scatter would shake the simulated cable."
         )
     if case.arms.strays(calibration.smallest_gap(0.0)):
         caveats.append(
-            f"The measured poses are {1e3 * case.arms.deviation:.3g} mm (root mean square) from where the commands "
-            "lead, and neither a gain nor a lag explains that. Check the frame and the units of gripper_command, "
-            "whether the commands of both arms were logged, and whether every motion was executed whole."
+            f"The measured poses deviate from the commanded ones by {1e3 * case.arms.deviation:.3g} mm (root mean "
+            "square), and neither a gain nor a lag explains that. Check the frame and the units of gripper_command, "
+            "whether the commands of both arms were logged, and whether every motion was executed to its end."
         )
     if case.recording.has_commands:
         off = np.linalg.norm((case.recording.gripper_pose - case.arms.commanded)[..., :2], axis=-1).max(axis=(1, 2))
@@ -84,26 +84,27 @@ def caveats_of(
             caveats.append(
                 f"Motions were not executed as commanded: the grippers of episode {int(off.argmax())} are up to "
                 f"{1e3 * off.max():.0f} mm from their commands, more than the {1e3 * MARGIN:g} mm by which a designed "
-                "motion keeps its bounds. The diagnosis uses the measured poses. If that was not meant, record them "
-                "again, or leave out their commands."
+                "motion keeps its bounds. The diagnosis uses the measured poses. If this was not intended, record the "
+                "motions again, or leave out their commands."
             )
     scatter, rapid = float(np.median(case.noise.std)), case.noise.rapid
     if case.noise.from_holds and rapid > 0 and scatter > _SCATTERED * rapid:
         caveats.append(
             f"Keypoints scatter by {1e3 * scatter:.2g} mm while the grippers rest, and by {1e3 * rapid:.2g} mm from "
-            "one sample to the next: their noise is correlated, or the cable still moves in what is marked as holds. "
-            "The larger number is taken for the noise, and gaps below it are not seen."
+            "one sample to the next: their noise is correlated, or the cable still moves in samples marked as holds. "
+            "The larger value is taken as the noise, and gaps below it are not detected."
         )
     if case.noise.restless:
         caveats.append(
             f"In {case.noise.restless} of the holds the keypoints scatter far more than in the others: the cable moves "
-            "there, and they say nothing of the noise. Mark as holds what is at rest, the cable included."
+            "there, so these holds are not used to estimate the noise. Mark only samples in which the cable is at rest "
+            "too."
         )
     if length is not None:
         caveats.append(
-            f"Keypoints are {length.apart}. A wrong length_m or keypoint_arclength_m does that, as do a camera's scale "
-            "and a cable that stretches: check the length before you believe either of these."
+            f"Keypoints are {length.apart}. A wrong length_m or keypoint_arclength_m causes this, and so do a camera's "
+            "scale and a cable that stretches: check the length before you trust a verdict of scale or stretch."
         )
     if case.noise.std.max() <= SMALLEST:
-        caveats.append(f"The keypoints carry no noise to speak of; {1e3 * SMALLEST:g} mm is assumed.")
+        caveats.append(f"The keypoints have almost no noise; {1e3 * SMALLEST:g} mm is assumed.")
     return tuple(caveats)

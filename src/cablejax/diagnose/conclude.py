@@ -283,13 +283,14 @@ def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
     if conclusion.verdict == "none" and conclusion.under_laws:
         law = max(conclusion.under_laws, key=lambda law: law.probability)
         return (
-            f"There is no gap that needs an effect if {law.assumes}, which fits this log better than the nominal law."
+            f"No effect is needed to explain this log if {law.assumes}: that assumption fits the log better than the "
+            "nominal one."
         )
     if conclusion.undecided:
-        return "There is a gap, but too little of it in this log to name its cause: record more motions."
+        return "There is a gap, but this log shows too little of it to name the cause: record more motions."
     parts = (conclusion.effects, conclusion.equivalent, conclusion.explained)
     said = verdict_sentence(conclusion.verdict, *parts, shrinkage)
     if not conclusion.nothing:
         return said
     chance = f"{100 * conclusion.nothing:.0f} %"
-    return f"{said} With a probability of {chance} it is no effect, but what the simulator itself is off by."
+    return f"{said} With a probability of {chance} there is no effect, and the gap is the simulator's own error."

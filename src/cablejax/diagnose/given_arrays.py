@@ -32,14 +32,14 @@ def checked_nominal(
     own = any(simulator.own(explanation((e, e.variants[0], e.null))) for e in effects)
     if own and (len(simulator.recording) != len(observed) or simulator.plan.parts is None):
         raise ValueError(
-            f"Recordings have numbers of their own (`own`), which needs `recording`, one number for each of "
+            "Recordings have parameters of their own (`own`), which needs `recording`, one number for each of "
             f"{len(observed)} episodes (it has {len(simulator.recording)}), and a plan that leaves out parts of them: "
             f"Plan(parts=...) of 2 or more (it is {simulator.plan.parts})."
         )
     if own and len(observed) < 2:
         raise ValueError(
-            "There is one episode, and recordings have numbers of their own (`own`): nothing could be left out of a "
-            "fit. Record more."
+            "There is one episode, and recordings have parameters of their own (`own`), so nothing can be left out of "
+            "a fit. Record more."
         )
     nulls: list[Explanation] = []
     for effect in effects:
@@ -59,7 +59,7 @@ def checked_nominal(
     nominal = predicted[0]
     seen = np.isfinite(observed)
     if not np.isfinite(nominal[seen]).all():
-        raise ValueError("The simulation without any effect breaks down where something was observed.")
+        raise ValueError("The simulation without any effect is not finite in samples that were observed.")
 
     def off(one, other, where) -> float:
         return float(np.where(where, np.abs(one - other) / noise, 0.0).max(initial=0.0))
@@ -73,8 +73,8 @@ def checked_nominal(
     last = np.asarray(simulator.predict([explanation()], everything[-1:]), float)
     if last.shape != (1, 1, *observed.shape[1:]) or not off(last[0], nominal[-1:], seen[-1:]) <= _SAME:
         raise ValueError(
-            f"predict for episode {len(observed) - 1} alone gave an array of shape {last.shape} that is not the last "
-            "part of what it gave for all episodes: it has to simulate the episodes that it is asked for."
+            f"predict for episode {len(observed) - 1} alone gave an array of shape {last.shape} that differs from the "
+            "last episode of its array for all episodes: it has to simulate the episodes that it is asked for."
         )
     return nominal
 
@@ -108,7 +108,7 @@ def inert_effects(simulator: Simulator, observed: Float[np.ndarray, "E T *O"], n
         gives = "exactly what it gives without" if finite == own else "values that are not finite"
         caveats.append(f"With {effect.name} ({values}) predict gives {gives}: the effect was not tried.")
     if simulator.effects and len(caveats) == len(simulator.effects):
-        raise ValueError(f"{' '.join(caveats)} Does predict use the explanations that it is given?")
+        raise ValueError(f"{' '.join(caveats)} Does predict use its explanations?")
     return caveats
 
 

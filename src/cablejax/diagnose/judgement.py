@@ -87,28 +87,32 @@ def verdict_sentence(
     faint = listed([effect_title(name) for _, members in split for name in members])
     explains = "which explains" if len(distinct) == 1 else "which together explain"
     rivals = f" (this log cannot tell apart: {alike})" if alike else ""
-    too = f" {faint[:1].upper()}{faint[1:]} would leave as little, at a probability below 1 %." if faint else ""
+    too = (
+        f" {faint[:1].upper()}{faint[1:]} would leave as little of the gap, but with a probability below 1 %."
+        if faint
+        else ""
+    )
     either = f" or a look-alike, which this log cannot tell apart: {alike}" if alike else ""
     better = shrinkage is None or shrinkage > 0
     best = (
-        f"the best explanation takes away {gone} of it"
+        f"the best explanation removes {gone} of it"
         if better
-        else "on motions left out of the fit, the best explanation does no better than none"
+        else "on motions left out of the fit, the best explanation predicts no better than the nominal simulator"
     )
     said = {
-        "none": "The simulator explains this log within what the noise and its own resolution allow.",
+        "none": "The simulator explains this log to within the noise and its own resolution.",
         "named": f"The gap comes from {names}, {explains} {gone} of it.",
         "ambiguous": f"The gap comes from {names}{either}.{too}",
         "named+unknown": (
-            f"Part of the gap, {gone}, looks like {names}{rivals}; the rest like no effect of the library.{too}"
+            f"Part of the gap, {gone}, looks like {names}{rivals}; the rest resembles no effect of the library.{too}"
         ),
         "unknown": f"No effect of the library explains the gap: {best}.",
     }[verdict]
     if not fitted_only:
         return said
     confirmed = _spelled(max(shrinkage or 0.0, 0.0))
-    again = "Repeat the motions in which it shows."
-    return f"{said} That is unconfirmed: on motions left out of the fit {confirmed} goes away. {again}"
+    again = "Repeat the motions in which the gap shows."
+    return f"{said} This is unconfirmed: on motions left out of the fit, it explains {confirmed}. {again}"
 
 
 def share(value: float) -> str:

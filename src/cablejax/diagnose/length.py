@@ -57,13 +57,14 @@ class Length(Reading):
     def told(self, diagnosis, probability):
         """See `Reading`."""
         caveat = (
-            f"Keypoints are {self.apart}. A cable of {self.measured:.4g} m explains this log better than any "
-            f"effect of one of the stated {self.stated:.4g} m (probability {probability:.2f}), and that length is "
-            "taken. Measure the cable between the grippers, and correct length_m and keypoint_arclength_m."
+            f"Keypoints are {self.apart}. A cable length of {self.measured:.4g} m explains this log better than any "
+            f"effect on a cable of the stated {self.stated:.4g} m (probability {probability:.2f}), so the diagnosis "
+            "assumes that length. Measure the cable between the grippers, and correct length_m and "
+            "keypoint_arclength_m."
         )
         return dataclasses.replace(
             diagnosis,
-            sentence=f"{diagnosis.sentence} That is so if {self.assumes}.",
+            sentence=f"{diagnosis.sentence} This assumes that {self.assumes}.",
             caveats=(caveat, *diagnosis.caveats),
             quantities={**diagnosis.quantities, "length_m": ParameterEstimate(self.measured, None, "m")},
         )

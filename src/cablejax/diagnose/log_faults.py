@@ -38,8 +38,8 @@ def without_frozen(points: Float[np.ndarray, "E T N 2"]) -> list[str]:
     if not len(found):
         return []
     return [
-        f"Keypoint {', '.join(map(str, found))} repeats its last value to the digit while its neighbours move: "
-        "taken as not observed there."
+        f"Keypoint {', '.join(map(str, found))} repeats its last value to the last digit while its neighbours move: "
+        "treated as not observed there."
     ]
 
 
@@ -61,9 +61,9 @@ def tool_offset(end: Float[np.ndarray, "E T 2"], pose: Float[np.ndarray, "E T 3"
         return []
     return [
         f"The keypoint at gripper {gripper} is {1e3 * abs(along):.1f} mm {'ahead of' if along > 0 else 'behind'} its "
-        f"pose and {1e3 * abs(across):.1f} mm beside it in the gripper's frame, in all samples: an offset of the "
-        "tool is no effect of the library and can look like one, and one of the marker is a keypoint bias. Correct the "
-        "pose if it is wrong."
+        f"pose and {1e3 * abs(across):.1f} mm beside it in the gripper's frame, in all samples. An offset of the tool "
+        "is not an effect of the library but can look like one: correct the pose. An offset of the marker is a "
+        "keypoint bias."
     ]
 
 
@@ -130,8 +130,9 @@ def early_keypoints(offset: tuple[float, str] | None) -> list[str]:
         return []
     seconds, fit = offset
     return [
-        f"The keypoints at the grippers fit their poses {seconds:.2g} s later: {fit}. The poses come late, or both "
-        "have clocks of their own, which is no effect of the library and can look like one: shift the poses."
+        f"The keypoints at the grippers fit their poses {seconds:.2g} s later: {fit}. The poses are stamped late, or "
+        "keypoints and poses have different clocks. This is not an effect of the library but can look like one: shift "
+        "the poses."
     ]
 
 
@@ -241,8 +242,9 @@ def command_fault(
     if as_is < _UNFIT or off(others[best]) > _FITS * as_is:
         return None
     return (
-        f"Field 'gripper_command' leads {as_is:.2g} m away from 'gripper_pose' (root mean square), expected twists "
-        f"(vx, vy, omega) in the world's frame, in m/s and rad/s. What fits the poses is {best}."
+        f"Field 'gripper_command' integrates to poses {as_is:.2g} m away from 'gripper_pose' (root mean square), "
+        "expected twists "
+        f"(vx, vy, omega) in the world's frame, in m/s and rad/s. They would fit the poses as {best}."
     )
 
 

@@ -118,8 +118,8 @@ def excluded(tried: list[Judged]) -> str:
     """A sentence on how many motions each bound excludes."""
     words = excluded_by(one.beyond for one in tried)
     return (
-        f"No motion keeps all bounds: of {len(tried)} that were tried, {words}. Relax the first of these, or record a "
-        "log that starts further inside the bounds."
+        f"No motion keeps all bounds: of the {len(tried)} motions tried, {words}. Relax the first of these bounds, or "
+        "record a log that starts further inside them."
     )
 
 

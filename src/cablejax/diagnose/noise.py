@@ -94,7 +94,7 @@ def noise_floor(
     smallest = max(smallest, _rounding(keypoints))
     common, variance = max(common, smallest**2), np.maximum(variance, smallest**2)
     if not common > 0:
-        raise ValueError("The observations have no noise that could be estimated: say how large it is.")
+        raise ValueError("The noise of these observations cannot be estimated: pass its standard deviation as `noise`.")
     error = common * np.sqrt(2.0 / np.maximum(count, 1.0))
     distinct = (np.abs(variance - common) > _DISTINCT * error) & (count >= 20)
     std = np.sqrt(np.where(distinct, variance, common))

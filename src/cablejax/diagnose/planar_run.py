@@ -85,7 +85,7 @@ def diagnose(
         conclusion = _worth_naming(conclusion, gap.shrinkage)
     following, none_kept = None, ()
     if conclusion.verdict != "none":
-        progress("looking for the next motion" if bounds is None else "designing the next motion")
+        progress("choosing the next motion" if bounds is None else "designing the next motion")
         judge = Judge.of(
             case.simulator.playback, found.fits, found.scores, evidence, calibration, bounds or Bounds(), objective
         )
@@ -154,7 +154,7 @@ def _read(
         reading, probability = max(likely, key=lambda one: one[1], default=(None, 0.0))
         if reading is None or reading.case is None or probability <= 0.5:
             return log, case, evidence, found, conclusion, length, taken
-        progress(f"again, as {reading.assumes}")
+        progress(f"diagnosing again, assuming that {reading.assumes}")
         taken.append((reading, probability))
         log, case = reading.log, reading.case
 
@@ -174,7 +174,7 @@ def _explained(
         under = np.maximum(growth, case.growth(conclusion.best.explanation))
         if (under <= _MORE_GROWTH * growth).all():
             return evidence, found, conclusion
-        progress("again, as small errors grow under the best explanation")
+        progress("diagnosing again, since small errors grow under the best explanation")
         growth = under
 
 
@@ -184,9 +184,11 @@ def _following(judge: Judge, design: DesignConfig | None) -> tuple[NextMotion | 
         return next_motion(judge, design), ()
     except BoundsError as error:
         why = (
-            str(error) if design is not None else "Under one of them the cable would snap over in all that were tried."
+            str(error)
+            if design is not None
+            else "In every motion that was tried, the cable would snap over under one of them."
         )
-        return None, (f"There is no motion to record next under the explanations found. {why}",)
+        return None, (f"No next motion is recommended for the explanations found. {why}",)
 
 
 def calibrated(length: float) -> Calibration:

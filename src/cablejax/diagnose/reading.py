@@ -61,18 +61,18 @@ class Held(Reading):
     case: Case
     off: float
 
-    assumes = "the cable begins as it was first seen, held there by the table"
+    assumes = "the cable starts in its first observed shape, held there by the table"
 
     def told(self, diagnosis, probability):
         """See `Reading`."""
         caveat = (
-            f"At the start, keypoints are up to {1e3 * self.off:.2g} mm from where the simulated cable would settle. "
-            f"A cable that begins as it was first seen, held there by the table's friction, explains this log best "
-            f"(probability {probability:.2f}), and that is how it is simulated here."
+            f"At the start, keypoints are up to {1e3 * self.off:.2g} mm from where the simulated cable would settle. A "
+            "cable that starts in its first observed shape, held there by the table's friction, explains this log best "
+            f"(probability {probability:.2f}), so it is simulated in this way."
         )
         return dataclasses.replace(
             diagnosis,
-            sentence=f"{diagnosis.sentence} That is so if {self.assumes}.",
+            sentence=f"{diagnosis.sentence} This assumes that {self.assumes}.",
             caveats=(caveat, *diagnosis.caveats),
         )
 

@@ -99,8 +99,8 @@ def prepare(log: GapLog) -> Recording:
     caveats: list[str] = []
     if n_episodes == 1:
         caveats.append(
-            "One episode only: nothing can be held out, so no shrinkage is reported, and every probability is "
-            "less certain than it looks."
+            "The log has one episode, so none can be held out: no shrinkage is reported, and every probability is less "
+            "certain than it looks."
         )
     short = [e for e in range(n_episodes) if log.episode_length[e] < _SHORTEST]
     if len(short) == n_episodes:
@@ -118,7 +118,7 @@ def prepare(log: GapLog) -> Recording:
         if not is_even(episode.time, interval):
             caveats.append(
                 f"The clock of episode {e} is up to {1e3 * furthest_off(episode.time, interval):.0f} ms off an even "
-                f"one: sampled again every {interval:g} s."
+                f"one: the episode was resampled every {interval:g} s."
             )
             episode = on_even_clock(episode, interval)
         episodes.append(episode)
@@ -137,8 +137,8 @@ def prepare(log: GapLog) -> Recording:
     marked, hold = hold, still(hold, pose)
     if wrong := int((marked & ~hold).sum()):
         caveats.append(
-            f"{wrong} of {int(marked.sum())} samples are marked as holds while the grippers move. They are not taken "
-            "for holds."
+            f"{wrong} of {int(marked.sum())} samples are marked as holds although the grippers move. They are not used "
+            "as holds."
         )
     caveats += without_frozen(points)
     recording = Recording(
@@ -156,7 +156,7 @@ def prepare(log: GapLog) -> Recording:
     if recording.has_commands and (fault := command_fault(pose, command, recording.interval, valid)):
         raise DiagnosisError(fault)
     if log.hold is None or not hold.any():
-        caveats.append("No holds are marked: the noise is taken to be white, and a slow drift would count as a gap.")
+        caveats.append("No holds are marked: the noise is assumed to be white, so a slow drift would count as a gap.")
     caveats += _without_commands(recording)
     return dataclasses.replace(recording, caveats=tuple(caveats))
 
@@ -236,7 +236,7 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
     gravity = np.asarray(log.meta["gravity_m_per_s2"], float)
     if np.linalg.norm(gravity[:2]) > _STEEP * np.linalg.norm(gravity):
         raise DiagnosisError(
-            f"Gravity is {gravity.tolist()} m/s^2, mostly in the plane of the keypoints: the cable hangs, and is "
-            "expected to lie on a table. Write the log with keypoints in space (D = 3)."
+            f"Gravity is {gravity.tolist()} m/s^2, mostly in the plane of the keypoints: the cable hangs, but a planar "
+            "log is of a cable on a table. Write the log with keypoints in space (D = 3)."
         )
     return caveats

@@ -75,7 +75,7 @@ def diagnose_simulator(
     if calibration is None:
         calibration = Calibration(baseline=_BASELINE * float(np.sqrt(np.mean(spread**2))))
         caveats.append(
-            f"No calibration was given: the simulator's own error is taken to be {_BASELINE:g} times the noise."
+            f"No calibration was given: the simulator's own error is assumed to be {_BASELINE:g} times the noise."
         )
     evidence = weighed(simulator, observed, nominal, spread, motion, calibration)
     examined = examine(evidence, interval, calibration, progress=progress)
@@ -93,8 +93,8 @@ def _far_out(conclusion: Conclusion) -> list[str]:
     """Caveats of fitted values that their prior did not expect."""
     best = conclusion.best.explanation
     return [
-        f"{term.effect.name}: {parameter.name} lies {abs(z):.1f} prior standard deviations from its median. If that is "
-        "possible, widen its prior."
+        f"{term.effect.name}: {parameter.name} lies {abs(z):.1f} prior standard deviations from its prior median. If "
+        "this value is plausible, widen the prior."
         for term, part in best.by_term()
         for parameter, z in zip(term.effect.parameters, part, strict=True)
         if abs(z) > _FAR

@@ -24,9 +24,9 @@ Ended = Literal["clear", "unknown", "inseparable", "rounds"]
 
 ENDED: dict[Ended, str] = {
     "clear": "The answer is clear.",
-    "unknown": "No effect of the library explains all of the gap.",
-    "inseparable": "No motion that was tried separates what is left: measure one of these causes by other means.",
-    "rounds": "No rounds are left: give more with --rounds.",
+    "unknown": "No effect of the library explains the whole gap.",
+    "inseparable": "No motion that was tried separates the remaining causes: measure one of them by other means.",
+    "rounds": "All rounds are used up: allow more with --rounds.",
 }
 """Why a study ended, in words."""
 
@@ -69,8 +69,8 @@ def first_recording(
     if not kept:
         words = excluded_by(broken.values())
         raise ValueError(
-            f"No way keeps the bounds, of those by which a study begins ({', '.join(goals)}): {words}. Make a first "
-            "recording of your own, and give it to `cablejax diagnose` with these bounds."
+            f"None of the first motions of a study ({', '.join(goals)}) keeps the bounds: {words}. Record a first "
+            "motion of your own, and give it to `cablejax diagnose` with these bounds."
         )
     return commands_log(kept, INTERVAL, cable)
 

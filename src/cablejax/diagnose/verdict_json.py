@@ -201,7 +201,7 @@ def _estimate_of(estimate: Mapping[str, Any]) -> ParameterEstimate:
 def _number(value: Any) -> Any:
     """The same value if it is a sensible number, or None where it is null. Raises TypeError otherwise."""
     if value is not None and value not in LIMITS["finite"]:
-        raise TypeError(f"{shown(value)} is no number that a diagnosis has")
+        raise TypeError(f"{shown(value)} is not a number that a diagnosis can have")
     return value
 
 

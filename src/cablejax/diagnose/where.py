@@ -100,7 +100,7 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
     valid = np.arange(nominal.shape[1]) < log.episode_length[:, None]
     residual = np.where(valid[..., None, None], log.keypoints.astype(np.float64) - nominal, np.nan)
     if not np.isfinite(residual).any():
-        raise ValueError("Not one keypoint is both observed and simulated: there is no gap to look at.")
+        raise ValueError("No keypoint is both observed and simulated, so there is no gap to locate.")
     regimes = regimes_of(log, nominal, valid)
     pose = np.where(valid[..., None, None], log.gripper_pose, np.nan)
     interval = np.array([usual_interval(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])

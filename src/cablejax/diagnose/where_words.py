@@ -43,7 +43,7 @@ def describe(
     shown = [e for e in seen if where.episode_p[e] < LEVEL]
     if not shown and not (where.keypoint_p < LEVEL).any():
         return (
-            f"No episode deviates from the simulator by more than its noise of {_mm(floor)}.",
+            f"No episode deviates from the simulator by more than the noise of {_mm(floor)}.",
             f"A gap of {_mm(max(where.smallest_mm, 0.01))} or more over the whole log would have shown.",
         )
     sentences = [_size(where, shown, floor, names), *_along(where, arclength), *_when(where), *_frame(where)]
@@ -92,7 +92,7 @@ def _along(where: Where, arclength: np.ndarray) -> list[str]:
     if ends.min() > 0.5 * profile.max():
         return [
             f"It reaches the grippers, {ends.min():.1f} mm at the smaller end against {profile.max():.1f} mm at most: "
-            "the picture, the arms or the grasps are off, not only the cable between them."
+            "the camera's frame, the arms or the grasps are off, not only the cable between them."
         ]
     near = np.flatnonzero(profile >= 0.5 * profile.max())
     low, high = marks[near[0]], marks[near[-1]]
@@ -107,7 +107,7 @@ def _along(where: Where, arclength: np.ndarray) -> list[str]:
         together = strong[-1] - strong[0] == len(strong) - 1
         if together and at[-1] - at[0] < 0.4 * (arclength[-1] - arclength[0]):
             place = f"between {at[0]:.2f} and {at[-1]:.2f} m" if at[-1] > at[0] else f"around {at[0]:.2f} m"
-            sentence = sentence[:-1] + f"; the cable bends differently {place} most."
+            sentence = sentence[:-1] + f"; the cable's bending differs most {place}."
     return [sentence]
 
 
@@ -120,10 +120,10 @@ def _when(where: Where) -> list[str]:
     if hold is not None and moving is not None:
         if "speed: hold" in known and known["speed: hold"][0] < 1 / _CLEAR_RATIO:
             sentences.append(
-                f"It comes with motion, {moving:.1f} mm against {hold:.1f} mm in holds: look for a lag or drag."
+                f"It grows with motion, {moving:.1f} mm against {hold:.1f} mm in holds: suspect a lag or drag."
             )
         elif hold > 0.7 * moving and hold > 0:
-            sentences.append(f"It stays while the grippers rest, {hold:.1f} mm in holds: not a lag.")
+            sentences.append(f"It remains while the grippers rest, {hold:.1f} mm in holds: not a lag.")
     if where.episode_p is None and slow is not None and fast is not None:
         sentences.append(f"It is {_mm(fast)} while the grippers move fast, {_mm(slow)} while they move slowly.")
     horizons = list(where.horizons_mm.items())
@@ -152,7 +152,7 @@ def _when(where: Where) -> list[str]:
 def _frame(where: Where) -> list[str]:
     frames = where.frames
     if frames.get("image", 0.0) > _FRAME_SHARE:
-        return [f"Shifting, turning and scaling the whole picture would remove {100 * frames['image']:.0f} % of it."]
+        return [f"Shifting, rotating and scaling the camera's frame would remove {100 * frames['image']:.0f} % of it."]
     best = max(("body", "table"), key=lambda name: frames.get(name, 0.0))
     if frames.get(best, 0.0) > _FRAME_SHARE:
         words = {
