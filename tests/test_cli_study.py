@@ -94,7 +94,9 @@ def test_first_recording_goes_to_the_goals_and_back_in_the_middle_of_the_workspa
 
 
 def test_bounds_without_room_are_refused():
-    with pytest.raises(ValueError, match=r"\(U, S, Z\): workspace excludes 3.*Make a first recording of your own"):
+    with pytest.raises(
+        ValueError, match=r"\(U, S, Z\) keeps the bounds: workspace excludes 3.*Record a first motion of your own"
+    ):
         first_recording(LONG, straight_start(LONG), GOALS, Bounds(workspace=((0.0, 0.0), (0.5, 0.5))))
     # the cable counts too, which sweeps farther than the grippers
     disc = Bounds(keep_out=((0.0, -0.45, 0.12),))

@@ -97,7 +97,7 @@ def test_where_the_cable_was_straightened_the_error_is_dotted_and_the_verdict_sa
     panel = figures.error_over_time({("U", "residual"): one}).axes[0]
     (dotted,) = (line for line in panel.lines if line.get_color() == "white")
     np.testing.assert_array_equal(np.isfinite(dotted.get_ydata()), action == Action.STRAIGHTEN)
-    assert any("to begin again" in text.get_text() for text in panel.texts)
+    assert any("for another try" in text.get_text() for text in panel.texts)
     assert one.verdict().endswith("It was being straightened for another try: more commands may reach the target.")
 
 

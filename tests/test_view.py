@@ -81,7 +81,7 @@ def test_a_data_set(tmp_path, capsys):
     store.write_shard(1, block(config, 1))
     answer, page = view(capsys, store.path)
     assert answer["page"] == str(tmp_path / "data.html")
-    for words in ("3 of 7", "4 are missing", "first shard, 3 trajectories", "it goes on where it stopped"):
+    for words in ("3 of 7", "4 are missing", "first shard, 3 trajectories", "it resumes where it stopped"):
         assert words in page, words
     assert page.count("<svg") == 1
 

@@ -45,10 +45,10 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
     rows = max(len(ranked), 3)
     y = rows - 1 - np.arange(len(ranked))
     # were there no other causes than those of the library
-    chance = "probability [%]" if diagnosis.effects else "probability, were it in the library [%]"
+    chance = "probability [%]" if diagnosis.effects else "probability, if the cause is in the library [%]"
     with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.0, 0.9 + 0.36 * rows), layout="constrained")
-        panels = [([100 * r.held_out_shrinkage for r in ranked], "share of the gap that it takes away [%]")]
+        panels = [([100 * r.held_out_shrinkage for r in ranked], "share of the gap that it removes [%]")]
         if likely:
             panels.insert(0, ([100 * (r.probability or 0.0) for r in ranked], chance))
         axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
@@ -81,7 +81,7 @@ def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
         x = np.arange(len(horizons))
         before, after = np.array([values for _, values in horizons]).reshape(-1, 2).T
         wide = 0.38 if explained else 0.5
-        _bars(ax, x - (wide / 2 if explained else 0), before, wide, believed, "simulator as believed")
+        _bars(ax, x - (wide / 2 if explained else 0), before, wide, believed, "nominal simulator")
         if explained:
             _bars(ax, x + wide / 2, after, wide, LIGHT.residual, explained_label(diagnosis))
         noise = f"noise of the recording, {gap.noise_floor_mm:.1f} mm"
@@ -109,7 +109,7 @@ def _bars(ax: Axes, x: np.ndarray, heights: np.ndarray, width: float, colour: An
 
 def _ahead(ax: Axes, errors: dict[str, float], believed: str, label: str | None) -> None:
     """Errors five seconds ahead of an observation; a ridge residual is a correction that knows no cause."""
-    kinds = {"nominal": ("as\nbelieved", believed), "ridge": ("online\nresidual", LIGHT.target)}
+    kinds = {"nominal": ("nominal\nsimulator", believed), "ridge": ("online\nresidual", LIGHT.target)}
     if label is not None:
         kinds["named"] = (label, LIGHT.residual)
     shown = [kind for kind in kinds if np.isfinite(errors.get(kind, np.nan))]

@@ -78,7 +78,7 @@ def cable_figure(diagnosis: CableDiagnosis) -> Figure:
             if explained is not None:
                 label = explained_label(diagnosis)
                 axes.plot(*cable_curve(explained).T, color=LIGHT.residual, lw=3.2 * thick, label=label)
-            believed, dashes = "simulator as believed", (0, (4, 2))
+            believed, dashes = "nominal simulator", (0, (4, 2))
             axes.plot(*cable_curve(nominal).T, color=LIGHT.direct, lw=2.0 * thick, ls=dashes, label=believed)
             axes.plot(*observed.T, "o", color=LIGHT.ink, ms=4.5 * thick, label="observed keypoints")
         _bar(ax, 0.1, "10 cm")

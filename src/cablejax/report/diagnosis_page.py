@@ -58,12 +58,12 @@ INFORMING = frozenset(
 """Effects that a model can be informed of, see `control.shaping.knowing`; the last three are for conditioned models."""
 _DPI = 150
 _SPACE_CAPTION = (
-    "Up to five seconds from two observations on, in the files with the largest, middling and smallest gaps. Drag to "
-    "turn, scroll to zoom. The solid line is a fit to recordings that this file is not part of."
+    "Up to five seconds of motion, simulated from two observed samples, in the files with the largest, median and "
+    "smallest gaps. Drag to turn, scroll to zoom. The solid line is a fit to other recordings than this file's."
 )
 _WHERE_CAPTION = (
-    "Top: the gap of each keypoint over the whole log. Below: each episode over time; the darker, the further beyond "
-    "the noise. Black bars mark holds. The cable's own gap fades towards the grippers that hold it."
+    "Top: the gap of each keypoint over the whole log. Below: each episode over time; darker means further above the "
+    "noise. Black bars mark holds. The cable's own gap fades towards the grippers that hold it."
 )
 _FILES_CAPTION = (
     "Each column is a file, each row a keypoint; white lines separate recordings. The cable's own gap fades towards "
@@ -169,15 +169,15 @@ def _works(diagnosis: CableDiagnosis) -> str:
     """What shows that the verdict holds, or what it lacks, in a sentence or two."""
     gap, limits = diagnosis.gap, len(diagnosis.caveats)
     if diagnosis.verdict == "none":
-        said = "The simulator moves as the recorded cable does, within the noise and its own error."
+        said = "The simulated cable moves like the recorded one, to within the noise and the simulator's own error."
     elif diagnosis.effects and gap.shrinkage is not None:
         said = f"With the cause, the gap shrinks by {share(gap.shrinkage)} on episodes that no fit has seen."
     elif diagnosis.effects:
-        said = "Nothing was held out from the fit, so this log does not show it: record a second motion."
+        said = "This log cannot show it, since no motion was held out of the fit: record a second motion."
     else:
         said = "Not on this log: no effect of the library explains enough of the gap, so none is named."
     noun = "limit" if limits == 1 else "limits"
-    return f"{said} {limits} {noun} of this verdict: see the end of the page." if limits else said
+    return f"{said} This verdict has {limits} {noun}: see the end of the page." if limits else said
 
 
 def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
@@ -190,7 +190,7 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
         title = "Part of the cause" if diagnosis.verdict == "named+unknown" else "Cause"
         yield (title, names, note)
         places = [p for p in (effect_place(e) for e in diagnosis.effects) if p]
-        yield ("Place of the cause", listed(places) if places else "no single place", _peak(diagnosis))
+        yield ("Place of the cause", listed(places) if places else "not in one place", _peak(diagnosis))
     elif diagnosis.verdict == "none":
         least = _least(diagnosis)
         where = " in a calm motion" if gap.before_rmse_mm > least else ""

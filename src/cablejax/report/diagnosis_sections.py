@@ -28,7 +28,7 @@ _CONTRADICTS = 0.1
 _RULES = {
     "lowest_cost": "best fit to the log itself",
     "bic": "best fit with Schwarz's penalty",
-    "sparse_regression": "best template without a fit",
+    "sparse_regression": "best-matching template, not fitted",
 }
 
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
@@ -73,17 +73,17 @@ def alike(diagnosis: CableDiagnosis) -> list[tuple[list[str], list[str]]]:
 def under_other_laws(diagnosis: Diagnosis) -> list[str]:
     """The verdict under each other law of the simulator, in words."""
     return [
-        f"If {law.assumes}, {_verdict_under(law)}. Among all laws that were tried, that one has a probability of "
-        f"{share(law.probability)} on this log; the intervals cover those by which the same effects are found."
+        f"If {law.assumes}, {_verdict_under(law)}. Of all laws that were tried, this one has a probability of "
+        f"{share(law.probability)} on this log. The intervals cover every law under which the same effects are found."
         for law in diagnosis.under_laws
     ]
 
 
 def _verdict_under(law: UnderLaw) -> str:
     if law.verdict == "none":
-        return "there is no gap that needs an effect"
+        return "no effect is needed"
     if law.verdict == "unknown":
-        return "no effect of the library is enough"
+        return "no effect of the library explains enough"
     named = []
     for effect in law.effects:
         # a place or a choice says less than how strong the effect is
@@ -95,7 +95,7 @@ def _verdict_under(law: UnderLaw) -> str:
         group = next((alike for alike in law.equivalent if effect.name in alike), (effect.name,))
         others = [effect_title(name) for name in group if name != effect.name]
         named.append(listed([f"{effect_title(effect.name)} ({', '.join(estimates)})", *others], "or"))
-    unknown = ", and something unknown" if law.verdict == "named+unknown" else ""
+    unknown = ", and an unknown cause" if law.verdict == "named+unknown" else ""
     return f"the cause is {listed(named)}{unknown}"
 
 
@@ -105,18 +105,17 @@ def what_is_left(diagnosis: CableDiagnosis) -> str:
         return ""
     gap = diagnosis.gap
     left = millimetres(max(gap.after_rmse_mm**2 - gap.noise_floor_mm**2, 0.0) ** 0.5)
-    text = (
-        f"What is left after the best explanation, {left} above the noise, is explained by none of the effects that "
-        "were tried."
-    )
+    text = f"The best explanation leaves a gap of {left} above the noise, which none of the tried effects explains."
     if diagnosis.leftover_p is None:
         return text
     share_of = f"{100 * diagnosis.leftover_p:.0f} %"
-    text += f" On labelled logs of simulated cables, right explanations leave as much in {share_of} of the cases."
+    text += (
+        f" On labelled logs of simulated cables, correct explanations leave as large a gap in {share_of} of the cases."
+    )
     if diagnosis.effects:
         text += (
-            f" Of the effects named there beside an unknown cause, {share(BESIDE_UNKNOWN)} are causes; the others only "
-            "resemble what is not in the library."
+            f" Of the effects named on those logs together with an unknown cause, {share(BESIDE_UNKNOWN)} are causes; "
+            "the others only resemble a cause that is not in the library."
         )
     return text
 
@@ -125,19 +124,19 @@ def ranking_note(diagnosis: CableDiagnosis) -> str:
     """Caption of the chart of the effects that were tried."""
     if any(ranked.probability is None for ranked in diagnosis.ranking):
         return (
-            "Every effect tried in the forward search, in that order: what it takes away on unseen recordings when it "
-            "joins those kept before it, as a share of the squared error without any effect. Negative: it makes them "
-            "worse. Not judged: its simulations were lost in many windows."
+            "Every effect tried in the forward search, in that order: the share of the squared error that it removes "
+            "on held-out recordings when added to the effects kept before it. The error without any effect is 100 %. "
+            "Negative: the effect increases the error. Not judged: its simulations failed in many windows."
         )
     note = "Every effect alone, the most probable first."
     shares = [ranked.held_out_shrinkage for ranked in diagnosis.ranking]
     if shares and max(shares) > shares[0] + _CONTRADICTS:
         note += (
-            " For the probability every motion counts alike; the share is of all squares, in which one motion where "
-            "the cable swings over can outweigh the others."
+            " Every motion has equal weight in the probability. The share is of the total squared error, in which one "
+            "motion where the cable swings over can outweigh the others."
         )
     if len({effect.name for effect in diagnosis.effects}) > 1:
-        note += " The cause named above is a set; alone, none of its members is enough."
+        note += " The cause named above is a set of effects; none of them is enough alone."
     return note
 
 
@@ -146,13 +145,13 @@ def how_far(diagnosis: CableDiagnosis) -> str:
     gap = diagnosis.gap
     added = listed(list(dict.fromkeys(effect_title(e.name) for e in diagnosis.effects))) or "the best explanation"
     if diagnosis.verdict == "none":
-        text = "There is no gap above the noise that could shrink."
+        text = "There is no gap above the noise to shrink."
     elif diagnosis.explained is None:
         text = "No effect was added to the simulator, so nothing shrinks."
     elif gap.shrinkage is None:
         text = (
-            "The log holds one motion, and all of it was fitted: there is nothing to check on, so how far the gap "
-            f"shrinks is not known. In the fit itself, the error falls from {millimetres(gap.before_rmse_mm)} to "
+            "The log holds one motion, and the fit used all of it. With no held-out motion, how far the gap shrinks is "
+            f"unknown. In the fit itself, the error falls from {millimetres(gap.before_rmse_mm)} to "
             f"{millimetres(gap.after_rmse_mm)} with {added}."
         )
     else:
@@ -162,7 +161,7 @@ def how_far(diagnosis: CableDiagnosis) -> str:
         interval = ""
         if gap.shrinkage_ci90 is not None:
             interval = f" (90 % interval over episodes: {between(*gap.shrinkage_ci90)})"
-        besides = ", to which constant offsets of the markers add" if in_space(diagnosis) else ""
+        besides = " plus constant offsets of the markers" if in_space(diagnosis) else ""
         text = (
             f"With {added} in the simulator, {share(gap.shrinkage)} of the squared gap above the noise goes "
             f"away{interval}, on {named}, each left out of the fit that predicts it. The error falls from "
@@ -172,8 +171,8 @@ def how_far(diagnosis: CableDiagnosis) -> str:
     if gap.ahead_mm is not None:
         ahead = {name: millimetres(value) for name, value in gap.ahead_mm.items()}
         text += (
-            f" Five seconds ahead of an observation, the simulator as believed is off by {ahead['nominal']}; "
-            f"with a ridge residual, which knows no cause, by {ahead['ridge']}"
+            f" Five seconds ahead of an observation, the nominal simulator is off by {ahead['nominal']}; with a ridge "
+            f"residual, which models no cause, by {ahead['ridge']}"
         )
         text += f"; with {added} and no residual by {ahead['named']}." if diagnosis.explained is not None else "."
     return text
@@ -182,7 +181,7 @@ def how_far(diagnosis: CableDiagnosis) -> str:
 def nothing_next(diagnosis: CableDiagnosis) -> str:
     """Why no motion is recommended."""
     if in_space(diagnosis):
-        return "No motion was evaluated: that is done for cables on a table only."
+        return "No motion was evaluated: this version recommends motions only for cables on a table."
     settled = diagnosis.verdict in ("none", "named")
     return "No explanations are left to separate." if settled else "No motion of the library would help."
 
@@ -233,8 +232,8 @@ def detail_tables(diagnosis: CableDiagnosis) -> list[Table]:
     ]
     tables: list[Table] = [
         (
-            f"All effects tried{' alone' if alone else ', in order, each on top of those kept before it'}",
-            ("effect", "what it is", "probability" if alone else "outcome", "share taken away", "left"),
+            f"All effects tried{' alone' if alone else ', in order, each added to those kept before it'}",
+            ("effect", "what it is", "probability" if alone else "outcome", "share removed", "left"),
             tried,
         ),
         ("Gap above the noise by regime", ("regime", "gap"), regimes),

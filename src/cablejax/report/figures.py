@@ -96,7 +96,7 @@ def error_over_time(runs: Runs) -> Figure:
             ax.set_yticks([t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if low / 1.4 <= t <= high * 1.3])
             ax.axhline(goal, color=LIGHT.target, lw=1.2, ls=(0, (5, 3)))
             if any(run.straightened.any() for run in pair.values()):
-                ax.text(0.98, 0.98, "dotted: straightened,\nto begin again", transform=ax.transAxes, **_NOTE)
+                ax.text(0.98, 0.98, "dotted: straightened\nfor another try", transform=ax.transAxes, **_NOTE)
         axes[0].text(0.0, goal / 1.08, f"{goal:.2g} cm", ha="left", va="top", color=LIGHT.muted, fontsize=9)
         _method_legend(figure, runs)
     return figure

@@ -58,9 +58,9 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
         ],
         tables=[_table(episodes, targets)],
         following=(
-            *([f"Make a gap log of it again: cablejax import {exported} {file} --out log.npz"] if exported else []),
+            *([f"Convert it back to a gap log: cablejax import {exported} {file} --out log.npz"] if exported else []),
             f"Find out what the simulator lacks: cablejax diagnose {'log.npz' if exported else file}",
-            f"Look at it in motion: cablejax export rerun {'log.npz' if exported else file} --out run.rrd",
+            f"View it in motion: cablejax export rerun {'log.npz' if exported else file} --out run.rrd",
         ),
         facts={
             **cable_facts(cable),
@@ -72,7 +72,7 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
 
 
 _SHAPES = (
-    "The cable at the start (light), on its way, and at the end (blue); dots are keypoints, the broad grey line is the "
+    "The cable at the start (light), in between, and at the end (blue); dots are keypoints, the broad grey line is the "
     "target where the log states one."
 )
 _COURSE = "Speed of the faster gripper, and distance of the keypoints to the target where the log states one."
@@ -87,7 +87,7 @@ def _noise(log: GapLog) -> tuple[str, str]:
     try:
         floor = noise_floor(points, log.hold, order=3) if planar else noise_floor(points, None, order=4)
     except ValueError:
-        return "not known", "the log is too short to separate it from motion"
+        return "not known", "the log is too short to separate noise from motion"
     source = "scatter while the grippers rest" if floor.from_holds else "scatter between neighbouring samples"
     return millimetres(1e3 * float(np.sqrt(np.mean(floor.std**2)))), source
 

@@ -59,13 +59,13 @@ def store_sheet(store: Store, name: str) -> Sheet:
         following=(
             f"Train a model on it: cablejax train --data {shlex.quote(name)}"
             if info.complete
-            else "Run the same command again: it goes on where it stopped.",
+            else "Run the same command again: it resumes where it stopped.",
             f"Write its cable to a file: cablejax cable --from {shlex.quote(name)} --out cable.toml",
         ),
         facts={
             **cable_facts(config.cable),
             "motions drawn and rejected": f"{info.attempts}",
-            "digest": info.digest or "none until all trajectories are there",
+            "digest": info.digest or "none until all trajectories are complete",
             "versions": ", ".join(f"{package} {version}" for package, version in info.versions.items()),
         },
     )
@@ -102,7 +102,7 @@ def weights_sheet(source: str | os.PathLike[str], name: str) -> Sheet:
         cards=[
             ("Trained on", listed([f"{row[1]} motions" for row in data]) or "not stated", "by data set"),
             ("Corrects", "no prior" if config.prior == "none" else f"the {config.prior} prior", ""),
-            ("Knows the cable's stiffness", "yes" if config.conditioned else "no", "as an input"),
+            ("Uses the cable's stiffness", "yes" if config.conditioned else "no", "as an input"),
             ("Mirrored cables move alike", "yes" if config.symmetric else "not exactly", ""),
             *cable_cards(cable),
         ],
@@ -131,7 +131,7 @@ def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
     return Sheet(
         kind="verdict",
         title=diagnosis.sentence,
-        lead=f"{name}: what a simulator lacks on a recording.",
+        lead=f"{name}: what the simulator lacks to explain a recording.",
         cards=[
             ("Cause", ", ".join(effect_title(e.name) for e in diagnosis.effects) or "none named", diagnosis.verdict),
             ("Error", f"{gap.before_rmse_mm:.3g} {unit}", f"with the explanation {gap.after_rmse_mm:.3g} {unit}"),
@@ -149,7 +149,7 @@ def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
         ],
         following=(
             *(
-                [f"Add what is named to the simulator: cablejax simulate --with {shlex.quote(name)}"]
+                [f"Simulate with the named effects: cablejax simulate --with {shlex.quote(name)}"]
                 if addable(diagnosis)
                 else []
             ),

@@ -110,9 +110,9 @@ def _worth(ax: Any, following: NextMotion) -> None:
     ax.tick_params(length=0, labelcolor=LIGHT.ink)
     if following.separates:
         ax.axvline(following.doubt, color=LIGHT.ink, lw=1.2, ls=(0, (5, 3)))
-        ax.set_title(f"Information on which explanation holds [nats]; dashed: the doubt, {following.doubt:.2g}")
+        ax.set_title(f"Information about which explanation holds [nats]; dashed: the doubt, {following.doubt:.2g}")
     else:
-        ax.set_title("Information on the parameters [nats]")
+        ax.set_title("Information about the parameters [nats]")
 
 
 def _window(following: NextMotion) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:

@@ -38,7 +38,7 @@ _SECTIONS: tuple[tuple[str, Callable[[Any], Figure], str], ...] = (
     (
         "Where the cable ended",
         figures.final_shapes,
-        "The last sample of each run over its target (broad grey line). Dots are the observed keypoints.",
+        "The last sample of each run, drawn over the target (broad grey line). Dots are the observed keypoints.",
     ),
     (
         "How the error fell",
@@ -48,14 +48,14 @@ _SECTIONS: tuple[tuple[str, Callable[[Any], Figure], str], ...] = (
     (
         "What the online residual contributes",
         figures.residual_share,
-        "Size of the residual's prediction relative to the learned model's and its own together, at each command. "
-        "It is fitted to the last samples before every command. Blank where the grippers rested.",
+        "Size of the residual's prediction relative to the sum of the learned model's and its own, at each command. "
+        "The residual is fitted to the last samples before every command. Blank where the grippers rested.",
     ),
     (
         "How far the planner trusts itself",
         figures.motion_bound,
-        "The bound on one gripper's motion in one step. It grows while the predicted progress is made and shrinks "
-        "while it is not.",
+        "The bound on one gripper's motion in one step. It grows while the cable makes the predicted progress, and "
+        "shrinks otherwise.",
     ),
 )
 
@@ -129,7 +129,7 @@ def _reached(pairs: Mapping[str, Mapping[Method, ClosedLoopRun]]) -> str:
         if own:
             counts.append(f"{sum(run.reached for run in own)} of {len(own)} {METHOD_LABEL[method]}")
     goal = max(run.goal_cm for runs in pairs.values() for run in runs.values())
-    return f"Targets reached to within {goal:.2g} cm: {listed(counts)}. Every figure is below."
+    return f"Targets reached to within {goal:.2g} cm: {listed(counts)}. See the results below."
 
 
 def animation_data(runs: Runs) -> dict[str, Any]:

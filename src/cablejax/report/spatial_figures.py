@@ -31,7 +31,7 @@ def recording_ends(diagnosis: CableDiagnosis, episodes: np.ndarray) -> np.ndarra
 
 def files_figure(diagnosis: CableDiagnosis) -> Figure:
     """The error of every keypoint in every file, before and after."""
-    parts = [("simulator as believed", diagnosis.nominal)]
+    parts = [("nominal simulator", diagnosis.nominal)]
     if diagnosis.explained is not None and diagnosis.effects:
         parts.append((explained_label(diagnosis), diagnosis.explained))
     with matplotlib.rc_context(DIAGNOSIS_STYLE):
@@ -65,7 +65,7 @@ def cable_still(diagnosis: CableDiagnosis) -> Figure:
     if diagnosis.explained is not None and diagnosis.effects:
         points["explained"] = diagnosis.explained[e, t]
     look = {
-        "nominal": {"color": LIGHT.direct, "ls": "--", "label": "simulator as believed"},
+        "nominal": {"color": LIGHT.direct, "ls": "--", "label": "nominal simulator"},
         "explained": {"color": LIGHT.residual, "lw": 2.5, "label": explained_label(diagnosis)},
         "observed": {"color": LIGHT.ink, "ls": "", "marker": "o", "ms": 5, "label": "recorded"},
     }

@@ -41,7 +41,7 @@ def study_sheet(
     last, rounds = found[-1], len(found)
     names = _causes(last)
     ranked = any(chance is not None for one in found for chance in _chances(one).values())
-    pictures = [(_beliefs(found), "How probable each cause was after each round, by all recordings so far.")]
+    pictures = [(_beliefs(found), "Probability of each cause after each round, given all recordings so far.")]
     return Sheet(
         kind="study",
         title=f"After {rounds} recording{'s' if rounds > 1 else ''}: {names}",
@@ -60,13 +60,16 @@ def study_sheet(
         tables=[
             (
                 "Rounds",
-                ("round", "recorded", "left open", "error without, with the cause", "page"),
+                ("round", "recorded", "left open", "error without and with the cause", "page"),
                 [_row(k, one, done) for k, (one, done) in enumerate(zip(found, motions, strict=True), 1)],
             )
         ],
         following=(
             *(
-                [f"Simulate with what was named, in this folder: cablejax simulate --with round_{rounds}/verdict.json"]
+                [
+                    "Simulate with the named effects, in this folder: cablejax simulate --with "
+                    f"round_{rounds}/verdict.json"
+                ]
                 if last.effects
                 else []
             ),
@@ -122,5 +125,5 @@ def _beliefs(found: Sequence[Diagnosis]) -> Figure:
             ax.set_yticks(range(len(names)), [effect_title(name) for name in names])
             ax.invert_yaxis()
             ax.set(xlim=(0.0, 1.12), title=f"after round {number}")
-        axes[-1].set_xlabel("probability, were the cause one of those tried")
+        axes[-1].set_xlabel("probability, if the cause is one of those tried")
     return figure
