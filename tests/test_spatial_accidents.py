@@ -109,13 +109,13 @@ def test_the_reader_learns_which_windows_and_what_was_done_with_them(with_a_lost
     lost[5], error[5], error[6] = True, 0.7, 0.3
     none = np.zeros(24, bool)
     first, second = accident_sentences(lost, error, windows, none)
-    assert "1 of 24 windows could not be simulated" in first and "(700 mm)" in first and "left out" in first
+    assert "1 of 24 windows could not be simulated" in first and "(700 mm)" in first and "excluded" in first
     assert "1 of 24 windows are off" in second and "(300 mm)" in second
     (many,) = accident_sentences(np.arange(24) < 8, _USUAL, windows, none)
-    assert "too many to be left out" in many and "and 3 more" in many
+    assert "too many to be excluded" in many and "and 3 more" in many
     assert accident_sentences(none, _USUAL, windows, none) == []
     (coarse,) = accident_sentences(none, _USUAL, windows, np.arange(24) == 4)
-    assert "1 of 24 windows were simulated with larger errors" in coarse and "file 0 from 0 s" in coarse
+    assert "1 of 24 windows have time-step errors above the tolerance" in coarse and "file 0 from 0 s" in coarse
 
 
 def test_how_each_simulation_ended_is_known(with_a_lost_window):
@@ -149,7 +149,10 @@ def test_windows_that_never_show_all_keypoints_are_counted():
     assert windows.name == ("0", "1", "3") and windows.left_out == ("file 2 from 0 s",)
     error, none = np.full(3, 0.004), np.zeros(3, bool)
     (sentence,) = accident_sentences(none, error, windows, none)
-    assert sentence.startswith("1 more windows have no second that begins") and "file 2 from 0 s." in sentence
+    assert (
+        sentence.startswith("1 more windows were left out, since none of their seconds begins")
+        and "file 2 from 0 s." in sentence
+    )
     assert windows_of(log).left_out == ()
 
 

@@ -226,7 +226,7 @@ def test_many_samples_a_second_are_averaged_and_keep_their_episodes():
     fast.keypoints[:] = log.keypoints[:, :1] + rng.normal(0, 1e-3, log.keypoints.shape)
     assert thinned(log) == (log, ())
     found, (told,) = thinned(fast)
-    assert "5 ms apart: the mean of every 2 is taken" in told
+    assert "5 ms apart: every 2 were averaged" in told
     assert len(found.episode_length) == len(log.episode_length) and found.episode_length[1] == 1
     assert found.episode_length[0] == log.episode_length[0] // 2
     n = int(found.episode_length[0])
@@ -311,7 +311,7 @@ def test_a_recording_at_another_rate_is_sampled_again():
     time = log.time.copy()
     time[1] *= 1.04
     even, repairs = on_one_clock(dataclasses.replace(log, time=time))
-    assert repairs and "sampled again" in repairs[0]
+    assert repairs and "resampled" in repairs[0]
     assert even.episode_length[1] == pytest.approx(1.04 * log.episode_length[1], abs=1)
 
 

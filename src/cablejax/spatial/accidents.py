@@ -62,17 +62,17 @@ def accident_sentences(
     result, torn = [], windows.torn
     few = kept(lost | off(error) | torn)
     treated = (
-        "They have little weight in fits, and are left out of the gap and of comparisons."
+        "They have little weight in fits, and are excluded from the gap and from comparisons."
         if not few[lost | off(error) | torn].any()
-        else "They are too many to be left out, and count in all figures."
+        else "They are too many to be excluded, so they count in all figures."
     )
-    look = "Look for jerks of the grippers and jumps of keypoints there."
+    look = "Check them for jerks of the grippers and jumps of keypoints."
     longest = f"{windows.arclength[-1]:.3g} m"
     for which, words, advice in (
         (
             torn,
-            f"have the grippers further apart than the {longest} of cable between them: it would tear. Leave those "
-            "parts out, or correct the arc lengths",
+            f"have the grippers further apart than the {longest} of cable between them, which would tear it. Leave "
+            "those parts out, or correct the arc lengths",
             treated,
         ),
         (
@@ -87,8 +87,7 @@ def accident_sentences(
         ),
         (
             coarse & ~lost & ~torn,
-            "were simulated with larger errors of the time steps than these may have, since the shortest are still too "
-            "long there",
+            "have time-step errors above the tolerance, even with the shortest time steps",
             "They count in all figures. " + look,
         ),
     ):
@@ -101,8 +100,8 @@ def accident_sentences(
         count = len(windows.left_out)
         more = f" and {count - _SHOWN} more" if count > _SHOWN else ""
         result.append(
-            f"{count} more windows have no second that begins with two samples of all keypoints, and were left out: "
-            f"{', '.join(windows.left_out[:_SHOWN])}{more}."
+            f"{count} more windows were left out, since none of their seconds begins with two samples of all "
+            f"keypoints: {', '.join(windows.left_out[:_SHOWN])}{more}."
         )
     return result
 

@@ -60,8 +60,8 @@ def thinned(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
             )
         )
     report = (
-        f"Samples are {1e3 * np.median(steps):.3g} ms apart: the mean of every {count} is taken, for the noise in two "
-        "that are close says too much of the velocity that a window begins with."
+        f"Samples are {1e3 * np.median(steps):.3g} ms apart: every {count} were averaged, since noise in two samples "
+        "this close dominates the velocity at the start of a window."
     )
     return stack_episodes(episodes, log.meta, holds=log.hold is not None), (report,)
 
@@ -108,7 +108,7 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         )
         episodes.append(even)
     report = (
-        f"Samples are {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms apart: sampled again every "
+        f"Samples are {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms apart: the log was resampled every "
         f"{1e3 * interval:.3g} ms."
     )
     log, fewer = thinned(stack_episodes(episodes, log.meta, holds=log.hold is not None))
@@ -140,7 +140,7 @@ def with_poses_in_time(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         )
     report = (
         f"The keypoints at the grippers fit their poses {abs(seconds):.2g} s {'later' if seconds > 0 else 'earlier'}: "
-        f"{fit}. Keypoints and poses have clocks of their own, which is no effect in space and can look like one: the "
-        "poses were shifted by that."
+        f"{fit}. Keypoints and poses have different clocks. This is not an effect in space but can look like one, so "
+        "the poses were shifted by this offset."
     )
     return stack_episodes(episodes, log.meta, holds=log.hold is not None), (report,)

@@ -142,11 +142,13 @@ def _to_fit(log: GapLog) -> tuple[Windows, int]:
     windows = windows_of(log)
     fitted = [i for i, split in enumerate(windows.split) if split != "eval"]
     if not fitted:
-        raise ValueError("All windows are of the eval split, which is not to be fitted: record or label others.")
+        raise ValueError(
+            "All windows are in the eval split, which is never fitted: record more, or label other windows for fitting."
+        )
     if len(fitted) < 2:
         raise ValueError(
             f"The log has one window to fit, of {windows.valid.sum(axis=1).max() * windows.interval:.3g} s, expected "
-            "two at least: nothing could be left out of a fit. Record more."
+            "at least two, so that one can be left out of a fit. Record more."
         )
     return windows.chosen(fitted), len(windows) - len(fitted)
 
@@ -218,56 +220,61 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
 
 def _caveats(windows, left_out, found, own) -> tuple[str, ...]:
     result = [
-        "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
-        "relative to the linear density only, that of the cable with its markers, and a wrong density "
-        "(linear_density) is not identifiable.",
-        "A lag between the keypoints and grippers whose poses were measured apart is no effect in space; it is looked "
-        "for in the keypoints at the grippers."
+        "The motion of a hanging cable does not depend on its weight. Stiffness, drag and added masses are estimated "
+        "relative to the linear density of the cable with its markers, and a wrong density (linear_density) is not "
+        "identifiable.",
+        "A lag between keypoints and separately measured gripper poses is not an effect in space; it is estimated from "
+        "the keypoints at the grippers."
         if windows.rolls
-        else "A camera that lags would shift keypoints and grippers alike, where both come from the same markers: "
-        "camera_lag is not identifiable.",
-        "The noise is what markers scatter by from one sample to the next. A marker that sits off the cable's "
-        "centreline, or off its stated place along the cable, is off all the time; that error is not part of the "
-        "noise, but of the constant offsets, as is what the simulator has wrong at rest.",
-        "Roll of the grippers about the cable is that of the log's quaternions."
+        else (
+            "Keypoints and gripper poses come from the same markers, so a camera lag would shift both alike: "
+            "camera_lag is not identifiable."
+        ),
+        "The noise is the scatter of markers from one sample to the next. A marker that sits off the centreline or "
+        "off its stated arc length has a constant error. That error belongs to the constant offsets, not to the "
+        "noise, and so does the simulator's error at rest.",
+        "The grippers' roll about the cable is taken from the log's quaternions."
         if windows.rolls
-        else "Roll of the grippers about the cable is not observed, or the nominal cable does not move more like the "
-        "recorded one with that of the log; it is taken as the least turn from their mean direction.",
-        "All effects that were tried are fitted together. The gap after is what the named ones leave, with their "
+        else (
+            "The grippers' roll about the cable is not observed, or the roll in the log does not bring the nominal "
+            "simulation closer to the recording. It is assumed to be the smallest rotation from their mean direction."
+        ),
+        "All effects that were tried are fitted together. The gap after is the error with the named effects, at their "
         "values from that fit, on recordings that no fit has seen.",
     ]
     if "gripper_rotation_offset" in found.tried:
         grips = GRIP * found.everything.explanation.own[np.unique(windows.group)]
         result.append(
-            "How the cable sits in the grippers is fitted for each recording: it differs by "
+            "The angle of the cable in the grippers is fitted for each recording: it differs by "
             f"{np.sqrt((grips**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen "
             "are predicted with the mean."
         )
     if own > OWN:
         result.append(
-            f"Noise in the two samples that each window begins with, and the simulated cable's edges, alone cause "
-            f"errors of {1e3 * own:.1f} mm. They are part of the gap after; up to one and a half times as much is none."
+            "Noise in the first two samples of each window and the edges of the simulated cable alone cause errors of "
+            f"{1e3 * own:.1f} mm. They are part of the gap after; errors of up to 1.5 times this size do not count as "
+            "a gap."
         )
     if windows.smoothed:
         result.append(
             f"The grippers' measured paths scatter by {1e3 * windows.smoothed:.2g} mm from one sample to the next. "
-            "They are smoothed; what is left of the scatter shakes the simulated cable, and a bending damping may come "
-            "out too large by it."
+            "They were smoothed. The remaining scatter shakes the simulated cable, so a bending damping may be "
+            "overestimated."
         )
     if left_out:
-        result.append(f"{left_out} windows are labelled eval; nothing was fitted to or scored on them.")
+        result.append(f"{left_out} windows are labelled eval; they were used neither for fits nor for scores.")
     if not found.time_steps.fine_enough:
         result.append(
-            f"The grippers move too fast for the finest time steps of the simulation: halving them would change it by "
-            f"{1e3 * found.time_steps.error:.1f} mm. Gaps of that size may be its own."
+            "The grippers move too fast for the finest time steps of the simulation: halving these would change the "
+            f"motion by {1e3 * found.time_steps.error:.1f} mm. Gaps of that size may be the simulation's own error."
         )
     parts = ("one half of the recordings", "the other half", "all recordings")
     if moving := [part for part, one in zip(parts, (*found.halves, found.everything), strict=True) if not one.settled]:
         result.append(
-            f"The parameters of the fit to {listed(moving)} still changed when predictions were last corrected for the "
-            "length of the simulator's edges and time steps: they may be off by more than their intervals."
+            f"The parameters of the fit to {listed(moving)} still changed in the last correction for the length of the "
+            "simulator's edges and time steps: they may be off by more than their intervals."
         )
     groups = len(np.unique(windows.group))
     if groups < 6:
-        result.append(f"Only {groups} recordings: intervals over recordings are rough.")
+        result.append(f"There are only {groups} recordings: intervals over recordings are rough.")
     return tuple(result)

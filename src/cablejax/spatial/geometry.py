@@ -35,7 +35,7 @@ def local_changes(log: GapLog, held: tuple[int, int]) -> tuple[str, ...]:
         least = _SMALLEST if gripper is not None else _SMALLEST_FREE
         odd = np.flatnonzero(np.abs(column - usual) > max(_SCATTERS * scatter, least))
         where = f"at gripper {gripper}" if gripper is not None else "on the free cable"
-        why = "it was gripped again" if gripper is not None else "a marker or the cable between has moved"
+        why = "it was gripped again" if gripper is not None else "a marker has moved, or the cable between them"
         for sign in (-1, 1):
             part = odd[np.sign(column[odd] - usual) == sign]
             if len(part):

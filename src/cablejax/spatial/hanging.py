@@ -66,7 +66,7 @@ class Photographs:
         if len(shape) != 3 or shape[0] < 3 or shape[1] < 5 or shape[2] != 2 or not np.isfinite(self.points).all():
             raise ValueError(
                 f"Photographs have points of shape {shape}, expected finite ones of shape [R, N, 2] with at least "
-                "three photographs, so that one can be left out, and five points."
+                "three photographs, so that one can be held out, and at least five points."
             )
         for name in ("length", "stiffness", "error"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
@@ -81,7 +81,8 @@ class Photographs:
         if not self.error < _RIG * self.length:
             raise ValueError(
                 f"Photographs.error is {self.error:.3g} m, expected less than {_RIG:.0%} of the wire's length, "
-                f"{self.length:g} m: nothing would count as a gap. `rig_error` holds for clamps that stay in one place."
+                f"{self.length:g} m: with a larger one no deviation would count as a gap. `rig_error` holds for clamps "
+                "that stay in one place."
             )
         first, last = (np.median(self.points[:, b, 0] - self.points[:, a, 0]) for a, b in ((0, 1), (-2, -1)))
         if first < 0 and last < 0:
@@ -92,8 +93,8 @@ class Photographs:
         ends = self.points[:, [0, -1], 1].mean(axis=1)
         if np.median(self.points[:, 1:-1, 1].mean(axis=1) - ends) > 0:
             raise ValueError(
-                "The wire hangs upwards from its clamps, expected the second coordinate to grow upwards: negate it, as "
-                "that of an image's pixels."
+                "The wire hangs upwards from its clamps, expected the second coordinate to grow upwards: negate it if "
+                "it counts pixels of an image downwards."
             )
 
     @property

@@ -152,7 +152,7 @@ def tried_with(
     error = unseen_error(cable, halves)
     accepted, chance = falls(before.error, error, cable.recording)
     counts = compared(before.error, error)[1]
-    word = "stays" if accepted else "does not help" if counts else "is lost in many windows, and not judged"
+    word = "stays" if accepted else "does not help" if counts else "fails in many windows, not judged"
     accidents = f", {off(error).sum()} windows off" if off(error).any() else ""
     was, now = (1e3 * moderated(e).mean() for e in (before.error, error))
     progress(f"{name}: {was:.2f} -> {now:.2f} mm on unseen recordings{accidents}, {word}")

@@ -166,7 +166,7 @@ def windows_of(log: GapLog) -> Windows:
         )
     pieces, left_out = _pieces(points[:, :, free], log.episode_length, samples, math.ceil(_SHORTEST / interval - 1e-9))
     if not pieces:
-        raise ValueError(f"No episode has {_SHORTEST:g} s that begin with two samples of all keypoints.")
+        raise ValueError(f"No episode has a stretch of {_SHORTEST:g} s whose first two samples show all keypoints.")
 
     def cut(array):
         rows = []
