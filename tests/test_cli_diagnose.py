@@ -93,7 +93,7 @@ def test_recordings_of_one_set_up_are_diagnosed_together(log, report, tmp_path, 
     assert "What each recording added" in (folder / "report.html").read_text()
     capsys.readouterr()
     assert main(["diagnose", halves[0], halves[0], "--out", str(tmp_path / "twice")]) == 2
-    assert "have an episode of the same samples" in capsys.readouterr().err
+    assert "share an episode with identical samples" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -373,5 +373,5 @@ def test_commissioning_logs_of_another_cable_and_the_log_itself_are_refused():
     other = dataclasses.replace(log, meta={**log.meta, "cable": cable}, keypoints=log.keypoints + np.float32(1e-3))
     with pytest.raises(ValueError, match="commissioning log 1 is not of the set-up of the log"):
         diagnose(log, commissioning=[other])
-    with pytest.raises(ValueError, match="have an episode of the same samples"):
+    with pytest.raises(ValueError, match="share an episode with identical samples"):
         diagnose(log, commissioning=[log])

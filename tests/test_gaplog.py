@@ -334,7 +334,9 @@ class TestJoined:
     def test_another_set_up_is_refused_by_the_field(self, cable, field):
         logs, names = self._halves()
         logs[1] = gap_log_from_episodes([episode(5, seed=1)], cable, source="test")
-        with pytest.raises(GapLogError, match=rf"b.npz is not of the set-up of a.npz: .*{field}.* Diagnose them apart"):
+        with pytest.raises(
+            GapLogError, match=rf"b.npz is not of the set-up of a.npz: .*{field}.* Diagnose them separately"
+        ):
             joined(logs, names)
 
     def test_arc_lengths_that_were_measured_apart_are_averaged(self):
@@ -381,17 +383,17 @@ class TestJoined:
             joined(logs, names)
 
     def test_the_same_recording_counts_once(self, log):
-        with pytest.raises(GapLogError, match=r"a\.npz and copy\.npz have an episode of the same samples"):
+        with pytest.raises(GapLogError, match=r"a\.npz and copy\.npz share an episode with identical samples"):
             joined([log, log], ["a.npz", "copy.npz"])
         # imported again: of another precision, and with corrected poses
         again = dataclasses.replace(log, keypoints=log.keypoints.astype(float), gripper_pose=log.gripper_pose + 0.01)
         # in another unit, and on a clock that began earlier
         later = dataclasses.replace(log, keypoints=log.keypoints.astype(float) * (1 + 1e-7), time=log.time + 1000.0)
         for copy in (again, later):
-            with pytest.raises(GapLogError, match="have an episode of the same samples"):
+            with pytest.raises(GapLogError, match="share an episode with identical samples"):
                 joined([log, copy], ["a.npz", "again.npz"])
         logs, names = self._halves()
-        with pytest.raises(GapLogError, match=r"both and b\.npz have an episode of the same samples"):
+        with pytest.raises(GapLogError, match=r"both and b\.npz share an episode with identical samples"):
             joined([joined(logs, names), logs[1]], ["both", "b.npz"])
         with pytest.raises(GapLogError, match="There are 1 names, expected one for each of the 2 gap logs"):
             joined(logs, ["a.npz"])

@@ -151,7 +151,7 @@ def test_headers_that_name_other_frames_are_told(tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "header", lambda time, original=header: original(time, next(frames)))
     bag = write_bag(tmp_path / "bag", points, grippers_of(points), StoragePlugin.MCAP)
     _, (told,) = import_mcap(bag, layout(tmp_path))
-    assert told == "The headers name the frames camera, world: positions are taken as of one frame."
+    assert told == "The headers name the frames camera, world: all positions are assumed to be in one frame."
 
 
 def test_headers_without_a_time_are_named(tmp_path):
@@ -170,7 +170,7 @@ def test_a_gap_in_a_gripper_cuts_the_recording(tmp_path):
     keep = (times < 0.795) | (times > 1.095)
     grippers["/left/pose"] = times[keep], poses[keep]
     log, repairs = import_mcap(write_bag(tmp_path / "bag", points, grippers, StoragePlugin.MCAP), layout(tmp_path))
-    assert log.episode_length.tolist() == [79, 91] and "one of the grippers is not seen" in repairs[0]
+    assert log.episode_length.tolist() == [79, 91] and "one of the gripper poses is missing" in repairs[0]
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_a_gap_in_a_gripper_cuts_the_recording(tmp_path):
         ("/right/pose", "/cable/keypoints", "PoseArray, expected geometry_msgs/msg/PoseStamped"),
         ('["/left/pose", "/right/pose"]', '["/left/pose"]', "expected the topics of gripper 0 and gripper 1"),
         ('unit = "m"', 'unit = "mm"', "expected 0.05 to 20"),
-        ('unit = "m"', 'unit = "m"\nup = "x"', "say that z is up"),
+        ('unit = "m"', 'unit = "m"\nup = "x"', "state that z is up"),
         ("[topics]", '[topics]\nclock = "/clock"', "unknown fields .*clock"),
     ],
 )

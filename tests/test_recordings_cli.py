@@ -54,13 +54,13 @@ def test_a_dangerous_pickle_is_refused_without_a_traceback(folder, tmp_path, cap
     (folder / "train" / "1.pkl").write_bytes(b"cos\nsystem\n(S'true'\ntR.")
     assert main(["import", "deform", str(folder), "--out", str(tmp_path / "log.npz")]) == 2
     shown = capsys.readouterr()
-    assert "asks for os.system" in shown.err and "Traceback" not in shown.err and shown.out == ""
+    assert "refers to os.system" in shown.err and "Traceback" not in shown.err and shown.out == ""
     assert not (tmp_path / "log.npz").exists()
 
 
 def test_a_wrong_frame_is_refused(folder, tmp_path, capsys):
     assert main(["import", "deform", str(folder), "--up", "y", "--out", str(tmp_path / "log.npz")]) == 2
-    assert "say that z is up" in capsys.readouterr().err
+    assert "state that z is up" in capsys.readouterr().err
 
 
 def test_a_wrong_name_for_the_log_is_refused(folder, capsys):

@@ -118,7 +118,7 @@ def test_a_take_ends_where_the_motion_has_another_name(tmp_path):
         ('unit = "mm"', 'unit = "m"', "measures 684.* 0.684 m if they are in mm"),
         ('unit = "mm"', 'unit = "ft"', "unit of length is 'ft'"),
         ('unit = "mm"', "", r"\[frame\] lacks unit, expected m, cm, mm or in"),
-        ('unit = "mm"', 'unit = "mm"\nup = "y"', "say that z is up"),
+        ('unit = "mm"', 'unit = "mm"\nup = "y"', "state that z is up"),
         ('unit = "mm"', 'unit = "mm"\nup = "w"', "up is 'w'"),
         ("count = 9", "count = 10", "has no column 'm10x'"),
         ("count = 9", 'count = "9"', r"\[columns\] count is '9', expected how many"),
@@ -129,7 +129,7 @@ def test_a_take_ends_where_the_motion_has_another_name(tmp_path):
         ('time_unit = "ms"', 'time_unit = "min"', "time_unit is 'min'"),
         ("diameter_m = 0.006", "diameter_m = -1", "expected a number from 1e-06 to 1 m"),
         ("diameter_m = 0.006", "diameter_m = inf", "expected a number from 1e-06 to 1 m"),
-        ('time_unit = "ms"', "", "usual time between samples of episode 0 is 10.0, expected .* unit of time"),
+        ('time_unit = "ms"', "", "usual time between samples of episode 0 is 10.0, expected .* Is the time in seconds"),
         ("diameter_m = 0.006", f"diameter_m = 0.006\nkeypoint_arclength_m = {list(range(9))}", "gives it 8 m: correct"),
         ("diameter_m = 0.006", f"diameter_m = {10**50}", "diameter_m is an integer of 167 bits"),
         ("count = 9", "count = 100000000", "count is 100000000, expected a whole number from 2 to 1000"),
@@ -173,7 +173,7 @@ def test_a_wrong_table_is_reported(tmp_path, change, message):
     ("change", "message"),
     [
         (lambda values: np.full_like(values, values[0]), "the same keypoints to the last digit"),
-        (lambda values: values * np.linspace(1.0, 1.5, len(values)), "a cable does not stretch so far"),
+        (lambda values: values * np.linspace(1.0, 1.5, len(values)), "a cable does not stretch that much"),
         (lambda values: 1e30 * values, "largest entry of keypoints is .*, expected a number"),
     ],
     ids=["frozen", "stretched", "huge"],
@@ -205,7 +205,7 @@ def test_the_quaternion_that_is_none_is_reported(tmp_path):
 
 
 def test_keypoints_in_the_plane_lie_on_a_table(tmp_path):
-    with pytest.raises(ValueError, match="friction coefficient is not given"):
+    with pytest.raises(ValueError, match="friction coefficient is missing"):
         import_csv(*written(tmp_path, in_the_plane(), PLANAR.replace("[table]\nfriction_coefficient = 0.1\n", "")))
 
 

@@ -131,7 +131,7 @@ def test_a_cable_that_does_not_hang_down_names_the_vertical(up):
     points = swinging() @ Frame(up).matrix  # a recording whose vertical is `up`
     require_hanging((into_frame(take(points), Frame(up)),), Frame(up))
     if up != "z":
-        with pytest.raises(ValueError, match=f"say that {up} is up"):
+        with pytest.raises(ValueError, match=f"state that {up} is up"):
             require_hanging((into_frame(take(points), stated),), stated)
 
 

@@ -58,7 +58,7 @@ def test_exchanged_markers_are_reported_by_number_and_sample():
     points = exchanged(swinging(), slice(60, 130), [0, 1, 2, 4, 3, 5, 6, 7, 8])
     _, repairs = restore_order((take(points), *others()))
     assert repairs == [
-        "Take a: keypoints 3, 4 had exchanged their names in 70 of 200 samples, from sample 60, and were put back."
+        "Take a: keypoints 3, 4 had exchanged their names in 70 of 200 samples, from sample 60, and were reordered."
     ]
 
 
@@ -80,7 +80,7 @@ def test_a_take_in_which_the_cable_is_torn_is_left_out():
     takes, repairs = prepare((take(torn(), "torn"), *others(5)), PAIRS)
     assert [one.name for one in takes] == [one.name for one in others(5)]
     assert len(repairs) == 1 and repairs[0].startswith("Take torn: along the keypoints the cable measures up to ")
-    assert repairs[0].endswith("left out. Was it torn, or had a marker come off?")
+    assert repairs[0].endswith("the take was left out. Was the cable torn, or did a marker come off?")
 
 
 def test_where_many_takes_stretch_the_cause_is_another_and_all_stay():
@@ -125,7 +125,7 @@ def test_a_branched_cable_is_refused_by_that_name():
     text = str(refused.value)
     assert "give keypoints 0 to 8" in text and "keypoints 9 to 11 leave it at keypoint 3" in text
     assert "keypoints 12 to 13 leave it at keypoint 5" in text and "leave out 9 to 13" in text
-    assert "lacks that of the branches" in text
+    assert "the mass of the branches is then missing" in text
     parents = [dataclasses.replace(one, keypoints=one.keypoints[:, :9]) for one in takes]
     assert len(prepare(tuple(parents), PAIRS)[0]) == 3
 
@@ -150,7 +150,9 @@ def test_two_cables_in_one_folder_are_refused(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(recording_cases, "SPACING", np.array([0.03, 0.11, 0.12, 0.1, 0.08, 0.1, 0.1, 0.04]))
         second = tuple(take(swinging(seed=seed), name) for seed, name in ((7, "x"), (8, "y")))
-    with pytest.raises(ValueError, match=r"of 2 cables: in take x, y the keypoints .* other 4 .* Import each cable by"):
+    with pytest.raises(
+        ValueError, match=r"2 different cables: in take x, y .* other 4 .* Import each cable separately"
+    ):
         prepare((*first[:2], *second, *first[2:]), PAIRS)
     assert len(prepare(first, PAIRS)[0]) == 4 and len(prepare(second, PAIRS)[0]) == 2
     # a marker that slipped, and another grip, are still the same cable
@@ -165,7 +167,7 @@ def test_two_of_the_real_cables_are_two():
     both = [takes_of(read_deform(DATA / "deform" / f"DLO{k}.npz")) for k in (2, 3)]
     for some in both:
         assert len(prepare(some, Setup(unit=None))[0]) >= 70
-    with pytest.raises(ValueError, match="of 2 cables: in take"):
+    with pytest.raises(ValueError, match="2 different cables: in take"):
         prepare((*both[0][:20], *both[1][:5]), Setup(unit=None))
 
 
@@ -216,7 +218,7 @@ def test_a_gripper_not_seen_for_long_cuts_a_take(column):
     points[80:110, column] = np.nan
     parts, repairs = cut_at_gaps((take(points),), HELD)
     assert samples_of(parts) == [("a/1", 80), ("a/2", 90)]
-    assert "in 30 samples one of the grippers is not seen" in repairs[0]
+    assert "in 30 samples one of the gripper poses is missing" in repairs[0]
 
 
 def test_a_gripper_not_seen_for_a_moment_is_filled_in():
@@ -224,7 +226,10 @@ def test_a_gripper_not_seen_for_a_moment_is_filled_in():
     points = right.copy()
     points[80:83, 7:] = np.nan
     parts, repairs = cut_at_gaps((take(points),), HELD)
-    assert samples_of(parts) == [("a", 200)] and "3 samples without one of the grippers were filled in" in repairs[0]
+    assert (
+        samples_of(parts) == [("a", 200)]
+        and "3 samples without one of the gripper poses were interpolated" in repairs[0]
+    )
     assert np.linalg.norm(parts[0].keypoints - right, axis=-1).max() < 2e-3
 
 
@@ -283,7 +288,7 @@ def test_a_tracker_that_holds_its_last_values_cuts_a_take():
     points[80:110] = points[79]
     parts, repairs = cut_at_gaps((take(points),), HELD)
     assert samples_of(parts) == [("a/1", 80), ("a/2", 90)]
-    assert "30 samples repeat the one before to the last digit" in repairs[0]
+    assert "30 samples repeat the previous one to the last digit" in repairs[0]
 
 
 def test_a_recording_without_noise_at_rest_is_no_gap():
@@ -309,7 +314,7 @@ def test_a_tracker_that_stops_is_noticed_beside_a_hidden_marker():
     points[:, 4] = np.nan
     points[100:130] = points[99]
     (one, *_), told = prepare((take(points), *others()), PAIRS)
-    assert len(one.time) < 200 and any("30 samples repeat the one before to the last digit" in text for text in told)
+    assert len(one.time) < 200 and any("30 samples repeat the previous one to the last digit" in text for text in told)
 
 
 def test_a_marker_that_jumps_is_not_observed_there():
@@ -343,7 +348,7 @@ def test_a_marker_whose_tracker_holds_it_is_not_observed_meanwhile():
     assert np.isnan(one.keypoints[71:130, 4]).all()
     points[71:130, 4] = np.nan
     np.testing.assert_array_equal(one.keypoints, points)
-    assert sentence.startswith("Take a: keypoint 4 repeats its last value to the digit in 59 of 200 samples")
+    assert sentence.startswith("Take a: keypoint 4 repeats its last value to the last digit in 59 of 200 samples")
 
 
 def test_exchanged_markers_are_put_back_while_another_is_not_observed():
@@ -405,7 +410,7 @@ def test_a_turn_that_no_arm_makes_is_told_and_one_that_is_back_is_filled_in():
 def test_a_gripper_never_seen_is_refused():
     points = swinging()
     points[:, 8] = np.nan
-    with pytest.raises(ValueError, match="Gripper 1 is located by keypoints 7 and 8, which are never both obs"):
+    with pytest.raises(ValueError, match="Gripper 1 is located by keypoints 7 and 8, which are never obs"):
         cut_at_gaps((take(points),), HELD)
     with pytest.raises(ValueError, match="never observed together"):
         prepare((take(points),), PAIRS)
@@ -427,13 +432,13 @@ def test_millimetres_are_recognised_or_refused():
     points = swinging()
     takes, repairs = prepare((take(1000 * points),), Setup(unit=None))
     np.testing.assert_allclose(takes[0].keypoints, points, rtol=1e-12)
-    assert "can only be mm" in repairs[0]
+    assert "is plausible only in mm" in repairs[0]
     takes, repairs = prepare((take(1000 * points),), Setup(unit="mm"))
     np.testing.assert_allclose(takes[0].keypoints, points, rtol=1e-12)
     assert repairs == []
     with pytest.raises(ValueError, match=r"0\.684 m if they are in mm"):
         prepare((take(1000 * points),), Setup(unit="m"))
-    with pytest.raises(ValueError, match="It may be in cm or in in: say which"):
+    with pytest.raises(ValueError, match="It may be in cm or in in: state which"):
         prepare((take(1.5 * points / 0.0254),), Setup(unit=None))
 
 
@@ -453,7 +458,7 @@ def test_a_left_handed_frame_is_mirrored_when_stated():
     takes, repairs = prepare((take(points @ frame.matrix),), Setup(frame=frame))
     np.testing.assert_allclose(takes[0].keypoints, points, atol=1e-12)
     assert repairs == []
-    with pytest.raises(ValueError, match="say that y is up"):
+    with pytest.raises(ValueError, match="state that y is up"):
         prepare((take(points @ frame.matrix),), Setup())
 
 

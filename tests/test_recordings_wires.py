@@ -32,7 +32,7 @@ def test_wires_are_read_with_what_was_published(tmp_path):
     [
         ({"keypoints": None}, "lacks keypoints"),
         ({"keypoints": np.zeros((2, 11, 3))}, r"keypoints has shape \(2, 11, 3\)"),
-        ({"keypoints": np.full((2, 3, 11, 3), np.nan)}, "not made of finite numbers"),
+        ({"keypoints": np.full((2, 3, 11, 3), np.nan)}, "has values that are not finite"),
         ({"wire": np.array(["white"])}, r"wire has shape \(1,\), expected \(2,\)"),
         ({"EI_published_Nm2": np.zeros((2, 5))}, r"EI_published_Nm2 has shape \(2, 5\), expected \(2, 3\)"),
         ({"length_m": np.float64(1500.0)}, "1.5 m if they are in mm"),

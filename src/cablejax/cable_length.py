@@ -49,13 +49,13 @@ def require_fitting_length(
     if excess[end] - excess[begin] > TOLERANCE * arclength[-1]:
         raise ValueError(
             f"From keypoint {begin} to {end} it usually is {usual[begin:end].sum():.4g} m from one to the next, but "
-            f"{name} gives them {stated[begin:end].sum():.4g} m of cable, and a cable does not stretch so far (noise "
-            f"of {1e3 * noise:.2g} mm is allowed for): correct {name}, or the unit of length."
+            f"{name} gives them {stated[begin:end].sum():.4g} m of cable, and a cable does not stretch that much "
+            f"(noise of {1e3 * noise:.2g} mm is allowed for): correct {name}, or the unit of length."
         )
     ring = float(ring_chords(stated).sum() / stated.sum())
     if usual.sum() < (ring - BENT) * stated.sum():
         raise ValueError(
-            f"Along the keypoints the cable usually measures {usual.sum():.4g} m, but {name} gives it "
+            f"Along its keypoints the cable usually measures {usual.sum():.4g} m, but {name} gives it "
             f"{stated.sum():.4g} m: correct {name}, or the unit of length."
         )
     whole = chords.sum(axis=1)[np.isfinite(chords).all(axis=1)]
@@ -63,7 +63,7 @@ def require_fitting_length(
     if long > (1 + STRETCH) / ring * short + 2 * len(stated) * noise:
         raise ValueError(
             f"Along the keypoints the cable measures {short:.4g} m in some samples and {long:.4g} m in others, and a "
-            "cable does not stretch so far: check the camera's scale, and that the markers stay on the cable."
+            "cable does not stretch that much: check the camera's scale, and that the markers stay on the cable."
         )
 
 

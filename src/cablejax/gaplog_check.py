@@ -108,7 +108,7 @@ def _check_clock(time: Float[np.ndarray, " T"], which: str) -> None:
     step = np.diff(time)
     if not len(step):
         return
-    usual, advice = round(float(np.median(step)), 9), "Is the unit of time right, which is a second?"
+    usual, advice = round(float(np.median(step)), 9), "Is the time in seconds?"
     begin = "Times are seconds from the episode's start: subtract the first of each episode."
     require(abs(float(time[0])), "duration", f"The first time {which}", begin)
     require(usual, "sample_interval", f"The usual time between samples {which}", advice)
@@ -116,7 +116,7 @@ def _check_clock(time: Float[np.ndarray, " T"], which: str) -> None:
     if time[-1] - time[0] > _LOST * usual * len(time):
         raise ValueError(
             f"Field 'time' has a pause of {step.max():.4g} s after sample {int(step.argmax())} {which}, where "
-            f"{usual:.4g} s is usual: make two episodes of it."
+            f"{usual:.4g} s is usual: split the episode there."
         )
 
 

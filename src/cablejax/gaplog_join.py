@@ -59,8 +59,8 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
             for other, other_name in (seen[i] for i in np.flatnonzero(alike)):
                 if _same_samples(one, other):
                     raise GapLogError(
-                        f"{other_name} and {name} have an episode of the same samples: name a recording once, or it "
-                        "would count twice."
+                        f"{other_name} and {name} share an episode with identical samples: give each recording once, "
+                        "or it would count twice."
                     )
         seen += [(one, name) for one in own]
         begun = np.concatenate([begun, first])
@@ -69,8 +69,8 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
             here, there = here_all.get(field), there_all.get(field)
             if not _same(here, there):
                 raise GapLogError(
-                    f"{name} is not of the set-up of {names[0]}: '{field}' is {shown(here)}, and there {shown(there)}. "
-                    "Diagnose them apart, or correct the one that states it wrongly."
+                    f"{name} is not of the set-up of {names[0]}: '{field}' is {shown(here)} instead of {shown(there)}. "
+                    "Diagnose them separately, or correct the log that states it wrongly."
                 )
     derived = np.concatenate([commands_derived(log) for log in logs])
     # what one of them guessed of the cable that they share is a guess

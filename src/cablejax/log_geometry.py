@@ -147,7 +147,7 @@ def cable_fault(log: GapLog) -> str | None:
             advice = (
                 f"it is at gripper {1 - gripper}. Exchange the grippers, or reverse the order of the keypoints."
                 if crossed < near
-                else "are the keypoints and the poses in one frame, in metres, and of one cable?"
+                else "are the keypoints and the poses in one frame, in metres, and of the same cable?"
             )
             return f"Keypoint {name} is {away:.2f} m from gripper {gripper}, expected it at the gripper: {advice}"
     # chords are shorter than the cable between them, the more so the fewer there are
@@ -156,8 +156,8 @@ def cable_fault(log: GapLog) -> str | None:
     ratio = float(np.nanmedian(chord)) if np.isfinite(chord).any() else 1.0
     if not (ring_chords(stated) / stated).min() - BENT <= ratio <= 1 + BENT:
         return (
-            f"The keypoints lie {ratio:.2f} times as far apart as meta.keypoint_arclength_m says: correct the length, "
-            "the unit, or the marks."
+            f"The keypoints lie {ratio:.2f} times as far apart as meta.keypoint_arclength_m states: correct the "
+            "length, the unit, or the arc lengths."
         )
     return None
 
@@ -181,12 +181,14 @@ def setup_fault(log: GapLog) -> str | None:
         if (times := _turns_less(angle, direction)) > _DEGREES_TURN:
             return (
                 f"The cable next to gripper {gripper} turns {times:.0f} times as far as the gripper's angle, and with "
-                "it: the angle is in units of 180 / pi rad, for it was converted from degrees, and was none."
+                "it: the angle is in units of 180 / pi rad, since it was converted from degrees although it was in "
+                "radians."
             )
         off = _median_angle(angle - direction)
         others = {
             "in degrees: expected radians. Multiply it by pi / 180.": np.radians(angle) - direction,
-            "in units of 180 / pi rad: it was converted from degrees, and was none.": np.degrees(angle) - direction,
+            "in units of 180 / pi rad: it was converted from degrees although it was in radians.": np.degrees(angle)
+            - direction,
             "with the other sign: either y or the angle is mirrored. Negate the angle.": -angle - direction,
             "a quarter turn further: expected the cable's tangent.": angle + np.pi / 2 - direction,
             "a quarter turn back: expected the cable's tangent.": angle - np.pi / 2 - direction,

@@ -74,8 +74,8 @@ def gap_log_from_takes(
     points = takes[0].keypoints.shape[1]
     if takes[0].keypoints.shape[2] == 2 and nominal.friction_coefficient is None:
         raise ValueError(
-            "The keypoints are in the plane, of a cable that lies on a table, and the table's friction coefficient is "
-            "not given: add it ([table] friction_coefficient), or give the third coordinate of a cable that hangs."
+            "The keypoints are in the plane, of a cable that lies on a table, but the table's friction coefficient is "
+            "missing: add it ([table] friction_coefficient), or give the third coordinate if the cable hangs."
         )
     arclength = measured_arclength(takes) if nominal.arclength is None else np.asarray(nominal.arclength, float)
     if arclength.shape != (points,) or arclength[0] != 0 or (np.diff(arclength) <= 0).any():

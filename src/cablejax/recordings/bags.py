@@ -79,7 +79,9 @@ def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
         raise ValueError(f"{path}: the messages on {keypoints_topic} have no poses, expected one for each keypoint.")
     poses, misread = None, []
     if len(frames) > 1:
-        misread.append(f"The headers name the frames {', '.join(sorted(frames))}: positions are taken as of one frame.")
+        misread.append(
+            f"The headers name the frames {', '.join(sorted(frames))}: all positions are assumed to be in one frame."
+        )
     if gripper_topics is not None:
         tracks = []
         for topic in gripper_topics:
@@ -92,8 +94,8 @@ def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
                 )
             if (apart := float(np.median(np.diff(stamps)))) > SLOWEST:
                 raise ValueError(
-                    f"{path}: the poses on {topic} are {apart:.3g} s apart, expected {SLOWEST:g} s at most: the "
-                    "gripper's motion in between is not known. Record them at a higher rate."
+                    f"{path}: the poses on {topic} are {apart:.3g} s apart, expected {SLOWEST:g} s at most, since the "
+                    "gripper's motion in between is unknown. Record them at a higher rate."
                 )
             track, jumps = without_misreadings(stamps, unit_quaternions(np.array(gripper_rows), f"{path}: {topic}"))
             misread += [f"{topic} {words}" for words in jumps.values()]

@@ -88,7 +88,7 @@ def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:
         return _read_npz(path)
     if path.suffix.lower() in (".pkl", ".pickle"):
         return _read_pickles(path, [path])
-    raise ValueError(f"{path} is not what was expected: an .npz file, a .pkl file, or a folder of .pkl files.")
+    raise ValueError(f"{path} is neither an .npz file, a .pkl file nor a folder of .pkl files.")
 
 
 def _read_npz(path: pathlib.Path) -> DeformRecordings:
@@ -127,7 +127,7 @@ def _read_pickles(path: pathlib.Path, files: list[pathlib.Path]) -> DeformRecord
         odd = next(file for file, count in zip(files, counts, strict=True) if count != most)
         raise ValueError(
             f"{odd} has {counts[files.index(odd)]} markers where the others have {most}: a gripper's pair is missing, "
-            "or it is another cable. Leave the file out, or import each cable by itself."
+            "or it is another cable. Leave the file out, or import each cable separately."
         )
     longest = max(map(len, blocks))
     keypoints = np.full((len(blocks), longest, counts[0], 3), np.nan)
@@ -184,7 +184,7 @@ def takes_of(recordings: DeformRecordings) -> tuple[Take, ...]:
         seen = np.flatnonzero(np.isfinite(points).any(axis=(1, 2)))
         if len(seen) == 0:
             raise ValueError(
-                f"{recordings.name}: block {recordings.source_id[index]} has no position at all: leave it out."
+                f"{recordings.name}: block {recordings.source_id[index]} has no observed position: leave it out."
             )
         points = points[: seen[-1] + 1]
         takes.append(

@@ -116,8 +116,8 @@ def onto_table(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
         raise ValueError(
             f"The layout has a [table], and keypoints lie {1e3 * extent[2]:.3g} mm above or below the others, expected "
             f"at most {1e3 * FLAT:g} mm (99 % of them; along the two horizontal axes they extend {1e3 * extent[0]:.3g} "
-            f"and {1e3 * extent[1]:.3g} mm). Check which axis points up, and that it is the table's normal; leave "
-            "[table] out of the layout of a cable that hangs."
+            f"and {1e3 * extent[1]:.3g} mm). Check which axis points up, and that it is the table's normal. For a "
+            "cable that hangs, leave [table] out of the layout."
         )
 
     def flat(take: Take) -> Take:
@@ -158,8 +158,8 @@ def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
     axis = int(np.argmax(abs(up)))
     found = ("" if up[axis] > 0 else "-") + "xyz"[axis]
     raise ValueError(
-        f"The frame is stated to have {frame.up} up, but the cable hangs from its ends opposite to {found}: "
-        f"say that {found} is up, or check the order of the coordinates."
+        f"The frame is stated to have {frame.up} up, but the cable sags in the direction opposite to {found}: state "
+        f"that {found} is up, or check the order of the coordinates."
     )
 
 

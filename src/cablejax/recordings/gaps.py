@@ -63,8 +63,8 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
         take, filled = _filled(take, on_grippers)
         if filled:
             reports.append(
-                f"Take {take.name}: {filled} samples without one of the grippers were filled in by straight lines: "
-                f"none of these gaps is longer than {_fillable(take):.2g} s."
+                f"Take {take.name}: {filled} samples without one of the gripper poses were interpolated linearly: none "
+                f"of these gaps is longer than {_fillable(take):.2g} s."
             )
         known = _known(take, on_grippers)
         breaks, reasons = _breaks(take)
@@ -79,7 +79,7 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
         kept = [(a, b) for a, b in long_enough if take.time[b - 1] - take.time[a] >= SHORTEST]
         if not known.all():
             reports.append(
-                f"Take {take.name}: in {int((~known).sum())} samples one of the grippers is not seen, for more than "
+                f"Take {take.name}: in {int((~known).sum())} samples one of the gripper poses is missing for more than "
                 f"{_fillable(take):.2g} s; they were left out."
             )
         if lost := sum(b - a for a, b in spans) - sum(b - a for a, b in kept):
@@ -97,8 +97,8 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
         steps = np.concatenate([np.diff(take.time) for take in takes])
         apart = f" Its samples are {np.median(steps):.3g} s apart: check the unit of time." if len(steps) else ""
         raise ValueError(
-            f"Between its gaps the recording has no stretch of at least {SHORTEST:g} s and {SHORTEST_SAMPLES} samples "
-            f"in which both grippers are known.{apart} What was found: " + " ".join(reports)
+            f"Between its gaps the recording has no stretch of at least {SHORTEST:g} s and {SHORTEST_SAMPLES} "
+            f"samples in which both gripper poses are known.{apart} Found: " + " ".join(reports)
         )
     return tuple(parts), reports
 
@@ -114,7 +114,7 @@ def _require_grippers(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | No
         else:
             pair = on_grippers[:2] if gripper == 0 else on_grippers[2:]
             seen = any(np.isfinite(take.keypoints[:, pair]).all(axis=(1, 2)).any() for take in takes)
-            what = f"is located by keypoints {pair[0]} and {pair[1]}, which are never both observed"
+            what = f"is located by keypoints {pair[0]} and {pair[1]}, which are never observed together"
         if not seen:
             raise ValueError(
                 f"Gripper {gripper} {what}. Both ends must be known: name the columns or topic of its pose, or two "
@@ -147,9 +147,9 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
         return take
     if slower := _slower(same):
         reports.append(
-            f"Take {take.name}: {int(same.sum())} samples repeat the one before to the last digit, one or more after "
-            f"each that is new: the tracker is about {slower} times slower than the recording. Only new samples are "
-            "kept."
+            f"Take {take.name}: {int(same.sum())} samples repeat the previous one to the last digit, at least one "
+            f"after each new sample: the tracker is about {slower} times slower than the recording. Only new samples "
+            "are kept."
         )
         new = np.append(True, ~same)
         pose = None if take.gripper_pose is None else take.gripper_pose[new]
@@ -164,8 +164,8 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
     if not repeated.any():
         return take
     reports.append(
-        f"Take {take.name}: {int(repeated.sum())} samples repeat the one before to the last digit, in a recording that "
-        "otherwise moves: they are taken as not observed."
+        f"Take {take.name}: {int(repeated.sum())} samples repeat the previous one to the last digit although the "
+        "recording otherwise moves: they are treated as not observed."
     )
     points = take.keypoints.copy()
     points[repeated] = np.nan
@@ -249,8 +249,8 @@ def _breaks(take: Take) -> tuple[list[int], list[str]]:
     for t in _jumps(median_step(take.keypoints), np.maximum(interval, usual), least):
         breaks.append(t + 1)
         reports.append(
-            f"Take {take.name}: the whole cable jumps between samples {t} and {t + 1}, so samples are missing that the "
-            "times do not show; the take was cut there."
+            f"Take {take.name}: the whole cable jumps between samples {t} and {t + 1}, so samples are missing without "
+            "a gap in the times; the take was cut there."
         )
     return breaks, reports
 

@@ -56,9 +56,9 @@ def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
         parent = branches[0][0]
         where = "; ".join(f"keypoints {first} to {last} leave it at keypoint {at}" for first, last, at in branches)
         raise ValueError(
-            f"This is a branched cable: after keypoint {parent - 1} the chain goes on near one of its own ({where}). "
-            "Only a cable without branches is simulated. To diagnose the parent alone, give keypoints 0 to "
-            f"{parent - 1} and leave out {parent} to {branches[-1][1]}; its mass then lacks that of the branches."
+            f"This is a branched cable: after keypoint {parent - 1} the chain continues next to an earlier keypoint "
+            f"({where}). Only a cable without branches is simulated. To diagnose the parent alone, give keypoints 0 to "
+            f"{parent - 1} and leave out {parent} to {branches[-1][1]}; the mass of the branches is then missing."
         )
     if len(usual) < _FEWEST:
         return takes, []
@@ -81,7 +81,7 @@ def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
             markers = np.flatnonzero((tracked != np.arange(len(usual) + 1)).any(axis=0)).tolist()
             repairs.append(
                 f"Take {take.name}: keypoints {', '.join(map(str, markers))} had exchanged their names in "
-                f"{changed.sum()} of {len(changed)} samples, from sample {int(np.argmax(changed))}, and were put back."
+                f"{changed.sum()} of {len(changed)} samples, from sample {int(np.argmax(changed))}, and were reordered."
             )
             points = np.take_along_axis(take.keypoints, tracked[:, :, None], axis=1)
             take = dataclasses.replace(take, keypoints=points)

@@ -115,7 +115,9 @@ def _content(library: Any, stream: BinaryIO) -> tuple[dict[str, Any], list[Any],
 
 def _episodes(meta: Mapping[str, Any], clouds: list[Any], samples: list[Any]) -> list[Episode]:
     if not samples or [cloud["stamp"] for cloud in clouds] != [sample["stamp"] for sample in samples]:
-        raise GapLogError(f"The messages on {KEYPOINTS} and {SAMPLES} are not of the same times. Export the log again.")
+        raise GapLogError(
+            f"The messages on {KEYPOINTS} and {SAMPLES} have different time stamps. Export the log again."
+        )
     dimension = 2 if np.shape(samples[0]["pose"])[-1] == 3 else 3
     groups = collections.defaultdict(list)
     for cloud, sample in zip(clouds, samples, strict=True):

@@ -157,8 +157,8 @@ class _Unpickler(pickle.Unpickler):
             return _NAMES[module_name, global_name]
         except KeyError:
             raise UnsafePickleError(
-                f"it asks for {module_name}.{global_name}, which no array of numbers needs: it may be meant to run "
-                "something."
+                f"it refers to {module_name}.{global_name}, which no array of numbers needs: the file may try to run "
+                "code."
             ) from None
 
     def persistent_load(self, pid: Any, /) -> Any:
@@ -206,7 +206,7 @@ def _check_opcodes(data: bytes) -> None:
             module, name = str(argument).split(" ", 1)
             if (module, name) not in _NAMES:
                 raise UnsafePickleError(
-                    f"it asks for {module}.{name}, which no array of numbers needs: it may be meant to run something."
+                    f"it refers to {module}.{name}, which no array of numbers needs: the file may try to run code."
                 )
 
 

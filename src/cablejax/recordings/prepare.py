@@ -157,9 +157,9 @@ def _require_one_cable(takes: tuple[Take, ...], setup: Setup) -> None:
     here, there = (np.exp(np.nanmedian(rows[part], axis=0)) for part in (~usual, usual))
     k = int(np.nanargmax(np.abs(np.log(here / there))))
     raise ValueError(
-        f"The takes are of {len(names)} cables: in take {', '.join(others[:_NAMED])}{more} the keypoints sit at other "
-        f"distances than in the other {usual.sum()} (keypoints {k + ends} and {k + ends + 1}: {1e3 * here[k]:.1f} mm "
-        f"instead of {1e3 * there[k]:.1f} mm). Import each cable by itself."
+        f"The takes show {len(names)} different cables: in take {', '.join(others[:_NAMED])}{more} the keypoints are "
+        f"at other distances from each other than in the other {usual.sum()} (keypoints {k + ends} and {k + ends + 1}: "
+        f"{1e3 * here[k]:.1f} mm instead of {1e3 * there[k]:.1f} mm). Import each cable separately."
     )
 
 
@@ -185,8 +185,8 @@ def _jerks(takes: tuple[Take, ...]) -> list[str]:
     strongest = [text for _, text in sorted(found, reverse=True)]
     more = f", and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
     return [
-        f"Sudden accelerations: {', '.join(strongest[:_TOLD])}{more}. They were kept; if the arm did not "
-        "move like that, leave that part out."
+        f"Sudden accelerations: {', '.join(strongest[:_TOLD])}{more}. They were kept; if the arm did not move in this "
+        "way, leave that part out."
     ]
 
 
@@ -202,13 +202,13 @@ def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...],
         elif len(candidates) == 1:
             unit = candidates[0]
             repairs.append(
-                f"The cable measures {length:.4g} along its keypoints, which can only be {unit}: all lengths were "
-                "converted to metres."
+                f"The cable measures {length:.4g} along its keypoints, which is plausible only in {unit}: all lengths "
+                "were converted to metres."
             )
         else:
             raise ValueError(
                 f"The cable measures {length:.4g} along its keypoints, expected {low:g} to {high:g} m. "
-                + (f"It may be in {' or in '.join(candidates)}: say which. " if candidates else "")
+                + (f"It may be in {' or in '.join(candidates)}: state which. " if candidates else "")
                 + "Name the unit of length, or check the order of the coordinates."
             )
     require_metres(length * METRES[unit], unit)

@@ -39,7 +39,7 @@ def without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[st
         return takes, []
     return tuple(kept), [
         f"{count} keypoint{'s' if count > 1 else ''} lay up to {farthest:.3g} m from the rest of the cable, which is "
-        f"{length:.3g} m long: taken as not observed."
+        f"{length:.3g} m long: treated as not observed."
     ]
 
 
@@ -56,13 +56,13 @@ def without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
             found[t] = _off_the_cable(points[t], along)
         return found
 
-    words = "is farther from its neighbours than the cable reaches in {where}: taken as not observed."
+    words = "is farther from its neighbours than the cable allows in {where}: treated as not observed."
     return _without(takes, off, words)
 
 
 def without_held(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
     """Marks keypoints as not observed that a tracker holds while the cable on both sides moves on, see `frozen`."""
-    words = "repeats its last value to the digit in {where}, while its neighbours move: taken as not observed."
+    words = "repeats its last value to the last digit in {where}, while its neighbours move: treated as not observed."
     return _without(takes, frozen, words)
 
 
@@ -95,7 +95,8 @@ def without_stretched(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[s
             continue
         reports.append(
             f"Take {take.name}: along the keypoints the cable measures up to {longest:.3g} m, usually {usual:.3g} m, "
-            "and a cable does not stretch so far: left out. Was it torn, or had a marker come off?"
+            "and a cable does not stretch that much: the take was left out. Was the cable torn, or did a marker come "
+            "off?"
         )
     return (tuple(kept), reports) if len(reports) <= _FEW_STRETCHED * len(takes) else (takes, [])
 

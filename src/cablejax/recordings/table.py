@@ -116,7 +116,9 @@ def _read(path: pathlib.Path) -> _Table:
     header = [name.strip() for name in rows[0][1]]
     for delimiter, name in _OTHER_DELIMITERS.items():
         if len(header) == 1 and delimiter in header[0]:
-            raise ValueError(f"{path} has cells between {name}, expected commas, and points in numbers: write it so.")
+            raise ValueError(
+                f"{path} has cells between {name}, expected commas, and decimal points: save it in that format."
+            )
     if header[0].startswith("#"):
         raise ValueError(f"{path} begins with a comment, expected the names of the columns in its first line.")
     if len(set(header)) < len(header):

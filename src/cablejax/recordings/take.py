@@ -41,7 +41,7 @@ class Take:
             row = int(np.argmax(~(np.diff(self.time) > 0))) + 1
             raise ValueError(
                 f"Take {self.name}: its times do not increase (sample {row}: {self.time[row]:.17g} after "
-                f"{self.time[row - 1]:.17g}): sort the samples and leave out what is there twice."
+                f"{self.time[row - 1]:.17g}): sort the samples and remove duplicates."
             )
         for name, values in (("keypoints", self.keypoints), ("gripper_pose", self.gripper_pose)):
             largest = 0.0 if values is None else float(np.nanmax(np.abs(values), initial=0.0))
@@ -77,7 +77,7 @@ def typical_spacing(takes: tuple[Take, ...]) -> Float[np.ndarray, " M"]:
     if not seen.all():
         index = int(np.argmin(seen))
         raise ValueError(
-            f"Keypoints {index} and {index + 1} are never observed together: leave out the one that is missing."
+            f"Keypoints {index} and {index + 1} are never observed together: leave out the keypoint that is missing."
         )
     return np.nanmedian(distances, axis=0)
 

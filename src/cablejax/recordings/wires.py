@@ -60,7 +60,7 @@ def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
             raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape} for these keypoints.")
     for name in _FIELDS[1:]:
         if not np.issubdtype(arrays[name].dtype, np.floating) or not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{path}: {name} is not made of finite numbers.")
+            raise ValueError(f"{path}: {name} has values that are not finite.")
     length = float(arrays["length_m"])
     require_metres(length, "m")
     return tuple(
