@@ -210,7 +210,7 @@ def test_shape_with_a_verdict_tells_the_model(tmp_path, capsys):
 def test_what_a_controller_cannot_be_made_of_is_refused():
     model = load_model("gns-reference")
     target, options = make_target("U", model.cable), {"method": "direct", "solver": "levenberg-marquardt"}
-    with pytest.raises(ValueError, match=r"0\.5 m along its keypoints.*of a cable of 1 m"):
+    with pytest.raises(ValueError, match=r"0\.5 m long along its keypoints.*for a cable of 1 m"):
         make_controller(model, make_target("U", Cable(length=0.5)), **options)
     for wrong in ({"method": "residuals"}, {"solver": "two-trial"}):
         with pytest.raises(ValueError, match="expected one of"):
@@ -223,7 +223,7 @@ def test_a_controller_plans_for_the_models_interval(model):
     fast = dataclasses.replace(model, config=config)
     controller = make_controller(fast, target, method="direct", solver="levenberg-marquardt")
     assert controller.interval == 0.5
-    with pytest.raises(ValueError, match=r"plans for 0\.5 s between commands, and the interval of this run is 1 s"):
+    with pytest.raises(ValueError, match=r"plans for 0\.5 s between commands, but the interval of this run is 1 s"):
         RobotLink(controller, target)
     RobotLink(controller, target, LinkConfig(interval=0.5))
 

@@ -114,12 +114,12 @@ def test_a_run_whose_end_was_hardly_seen_is_not_a_success():
         return dataclasses.replace(run, keypoints=keypoints, error_cm=error)
 
     assert observed(*range(7)).reached and not observed(0, 12).reached
-    assert "at the end 2 of 13 keypoints were seen, of which keypoint" in observed(0, 12).verdict()
-    assert "at the end 0 of 13 keypoints were seen." in observed().verdict()
+    assert "at the end 2 of 13 keypoints were observed, of which keypoint" in observed(0, 12).verdict()
+    assert "at the end 0 of 13 keypoints were observed." in observed().verdict()
     # the simulation knows better than its camera
     assert dataclasses.replace(observed(0, 12), error_cm=run.error_cm).reached
     nothing = dataclasses.replace(observed(), error_cm=np.full(15, np.nan))
-    assert nothing.verdict() == "U: no keypoint of the cable was ever seen."
+    assert nothing.verdict() == "U: no keypoint of the cable was ever observed."
 
 
 def test_a_taut_pull_stops_the_run():

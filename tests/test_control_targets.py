@@ -76,7 +76,7 @@ def test_length_of_a_polyline_is_not_mistaken_for_another_cable(shape, points):
     letter = make_target(shape, cable)
     letter.require_length(cable.length, "the model")
     target_from_keypoints("mine", letter.keypoints, cable)
-    with pytest.raises(ValueError, match=r"the model is of a cable of 0.6 m: take one of the other's length"):
+    with pytest.raises(ValueError, match=r"the model is for a cable of 0.6 m: use a target of that length"):
         dataclasses.replace(letter, keypoints=6 * letter.keypoints).require_length(0.6 * cable.length, "the model")
 
 

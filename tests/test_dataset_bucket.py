@@ -133,7 +133,7 @@ def test_a_bucket_holds_what_a_folder_holds(wire, tmp_path):
     with pytest.raises(ValueError, match=r"s3://cables/none holds no data set"):
         open_store("s3://cables/none")
     Bucket("s3://cables/other").write("letter.txt", b"hello")
-    with pytest.raises(ValueError, match="holds something, but no data set"):
+    with pytest.raises(ValueError, match="holds objects, but no data set"):
         open_or_create("s3://cables/other", TINY)
     _clear(Bucket("s3://cables/data.zarr"), TINY)
     assert open_store("s3://cables/data.zarr").config == TINY
@@ -213,7 +213,7 @@ def test_places():
     assert Bucket("s3://a/b/c.zarr").name == "c.zarr" and str(place_of("runs/s3:/x")) == "runs/s3:/x"
     assert place_of("S3://a/b") == Bucket("s3://a/b")
     for wrong in ("s3://", "s3:///a/b", "s3:a"):
-        with pytest.raises(ValueError, match="no place in object storage, expected s3://BUCKET/PREFIX"):
+        with pytest.raises(ValueError, match="not an address in object storage, expected s3://BUCKET/PREFIX"):
             place_of(wrong)
 
 

@@ -329,7 +329,7 @@ def listening():
 @pytest.mark.usefixtures("listening")
 def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(reference, tmp_path):
     path = tmp_path / "data"
-    with pytest.raises(GenerationInterrupted, match=r"Stopped at 4 of 8 .* again to go on"):
+    with pytest.raises(GenerationInterrupted, match=r"Stopped at 4 of 8 .* again to resume"):
         generate(TINY, path, progress=False, engine=Interrupted(TINY.discretisation))
     assert open_store(path).info().n_complete == 4
     engine = Interrupted(TINY.discretisation)

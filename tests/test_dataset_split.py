@@ -72,7 +72,9 @@ def test_what_is_held_out_of_one_store_is_not_trained_on_in_another(tmp_path):
         return store
 
     few, many = of("few", 4), of("many", 8)
-    with pytest.raises(ValueError, match=r"1 of the 1 trajectories that are held out of .*few are among .*many"):
+    with pytest.raises(
+        ValueError, match=r"1 of the 1 trajectories held out of .*few are training trajectories of .*many"
+    ):
         read_split([few, many], 0.3)
     read_split([few, few], 0.3)  # twice the weight, and the same are held out
 

@@ -151,7 +151,7 @@ def test_a_failed_write_leaves_no_shard_that_looks_whole(tmp_path):
 def test_a_store_that_is_removed_meanwhile_says_so(tmp_path):
     store = open_or_create(tmp_path / "data", SMALL)
     shutil.rmtree(tmp_path / "data")
-    with pytest.raises(ValueError, match=r"data has no keypoints any more: was it removed\?"):
+    with pytest.raises(ValueError, match=r"data no longer has keypoints: was it removed\?"):
         store.write_shard(0, block(SMALL, 0))
 
 
@@ -203,7 +203,7 @@ def test_a_damaged_description_is_refused_and_mended(tmp_path, damage):
     complete(open_or_create(path, SMALL))
     digest = open_store(path).info().digest
     damage(path)
-    with pytest.raises(ValueError, match=r"is damaged: .*Run the generation that began it again"):
+    with pytest.raises(ValueError, match=r"is damaged: .*Run the command that generated it again"):
         open_store(path)
     store = open_or_create(path, SMALL)
     assert [store.status(shard) for shard in range(3)] == ["complete"] * 3
@@ -301,7 +301,7 @@ def test_a_store_from_a_version_with_other_options_is_refused(tmp_path):
 
 def test_a_folder_that_is_something_else_is_left_alone(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="holds no data set"):
+    with pytest.raises(ValueError, match="holds files other than a data set"):
         open_or_create(tmp_path, SMALL)
     with pytest.raises(ValueError, match="is a file"):
         open_or_create(tmp_path / "notes.txt", SMALL)

@@ -96,7 +96,7 @@ def test_symmetric_effects_have_no_side_no_end_and_no_place(effect):
 def test_two_patches_at_a_time_are_refused():
     chain, text = Discretisation(Cable()), "friction_patch:x_m={},y_m=0,radius_m=0.1,coefficient=0.6,from_s={}"
     one, other, later = (parse_effect(text.format(x, start)) for x, start in ((0.2, 0), (0.5, 10), (0.5, 20)))
-    with pytest.raises(ValueError, match=r"friction_patch is given twice .* one at a time"):
+    with pytest.raises(ValueError, match=r"friction_patch is given twice .* each effect once"):
         with_effects(nominal_physics(chain), [one, other], chain)
     with_effects(nominal_physics(chain), [dataclasses.replace(one, until_s=20.0), later], chain)
 
@@ -300,7 +300,7 @@ def test_a_short_cable_that_is_carried_far_is_searched_for_obstacles_in_time():
 
 def test_an_effect_without_an_opposite_is_not_reversible():
     positive = Parameter("size", "", 1e-3, 1e3, 1.0, 1.0, log=True)
-    with pytest.raises(ValueError, match="has no opposite"):
+    with pytest.raises(ValueError, match="its opposite does not exist"):
         Effect(name="mine", parameters=(positive,), null=(0.0,), amplitude=0, reversible=True)
 
 

@@ -69,11 +69,13 @@ def test_what_started_symmetric_predicts_the_same_and_learns_a_side(tmp_path, co
 
 def test_what_does_not_fit_is_refused(trained, tmp_path):
     path, _ = trained
-    with pytest.raises(ValueError, match=r"latent is 8 there and 16 here\. Only `conditioned` may be added"):
+    with pytest.raises(ValueError, match=r"latent is 8 in that model and 16 here\. Only adding `conditioned` and"):
         starting_from(path, dataclasses.replace(SMALL, latent=16))
-    with pytest.raises(ValueError, match=r"symmetric is False there and True here\. .* and `symmetric` left out"):
+    with pytest.raises(
+        ValueError, match=r"symmetric is False in that model and True here\. .* and dropping `symmetric`"
+    ):
         starting_from(path, dataclasses.replace(SMALL, symmetric=True))
-    with pytest.raises(ValueError, match="conditioned model is trained on what is known"):
+    with pytest.raises(ValueError, match="conditioned model is trained with a descriptor"):
         train(resized(TINY_TRAINING, conditioned=True), trajectories(), tmp_path / "run", progress=False)
     with pytest.raises(ValueError, match=r"needs History\.cable"):
         apply(network(CONDITIONED), arched_history(SMALL), TWIST)

@@ -173,7 +173,7 @@ def test_a_training_that_goes_on_with_other_packages_says_so(tmp_path):
     (tmp_path / "run.json").write_text(json.dumps(stored))
     claim()
     (line,) = lines
-    assert f"begun with other packages: jax (0.1.0, now {jax.__version__}). The training goes on" in line
+    assert f"begun with other packages: jax (0.1.0, now {jax.__version__}). The training continues" in line
     del stored["versions"]  # as trainings were before they recorded them
     (tmp_path / "run.json").write_text(json.dumps(stored))
     claim()

@@ -274,7 +274,7 @@ def test_wrong_targets_are_refused():
     with pytest.raises(ValueError, match=r"expected \(7, 2\) as the cable"):
         ShapeCableEnv(dataclasses.replace(CONFIG, targets=(make_target("U"),)))
     longer = dataclasses.replace(CONFIG.cable, length=2 * CONFIG.cable.length)
-    with pytest.raises(ValueError, match="and the environment is of a cable of 1 m"):
+    with pytest.raises(ValueError, match="but the environment is for a cable of 1 m"):
         ShapeCableEnv(CONFIG).reset(options={"target": make_target("U", longer)})
     with pytest.raises(ValueError, match="no shape 'X'"):
         ShapeCableEnv(CONFIG).reset(options={"target": "X"})

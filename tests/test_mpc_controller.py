@@ -523,7 +523,7 @@ def test_a_model_that_gives_no_displacements_is_refused_at_the_start(dynamics, m
 
 def test_millimetres_and_whole_targets_are_refused():
     millimetres = jax.tree.map(lambda x: 1000.0 * x, at_rest(START))
-    with pytest.raises(ValueError, match=r"m apart, and the cable is .* expected poses and keypoints in metres"):
+    with pytest.raises(ValueError, match=r"m apart, but the cable is .* expected poses and keypoints in metres"):
         controller().init(millimetres)
     whole = Target("own", np.asarray(hermite_shape(START, N)), np.asarray(START))
     with pytest.raises(ValueError, match=r"The target is a Target, expected an array of keypoints .*: its `keypoints`"):

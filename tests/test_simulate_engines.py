@@ -140,7 +140,7 @@ def test_twists_beyond_the_cables_reach_are_warned_of_where_they_are_differentia
     state, params = engine.initial_state(np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])), nominal_physics(engine.config)
     apart = jnp.zeros((1, 2, 3)).at[0, 1, 0].set(1e-3)
     for direction in (apart, jnp.zeros_like(apart)):
-        with pytest.warns(UserWarning, match=r"commanded 1\.0010 m apart and the cable is 1 m long"):
+        with pytest.warns(UserWarning, match=r"commanded 1\.0010 m apart but the cable is 1 m long"):
             jax.jvp(lambda twist: engine.rollout(params, state, twist)[1].keypoints, (apart,), (direction,))
     with pytest.warns(UserWarning, match=r"commanded 1\.0000 m apart .* it is taut"):
         engine.rollout(params, state, jnp.zeros_like(apart))

@@ -39,8 +39,8 @@ def check_interval(controller: Controller, interval: float) -> None:
     own = getattr(controller, "interval", interval)
     if not math.isclose(own, interval):
         raise ValueError(
-            f"The controller plans for {own:g} s between commands, and the interval of this run is {interval:g} s. "
-            "Give both the same: `interval` of the run, and of `MPCConfig.objective`."
+            f"The controller plans for {own:g} s between commands, but the interval of this run is {interval:g} s. Set "
+            "both to the same value: `interval` of the run, and of `MPCConfig.objective`."
         )
 
 

@@ -156,7 +156,9 @@ class RobotLink:
         near = pose if np.isfinite(pose).all() or last is None else last.gripper_pose
         keypoints[~(np.abs(keypoints) <= largest)] = np.nan
         if last is not None and ends_exchanged(pose[:, :2], last.gripper_pose[:, :2], self.target.length):
-            raise ValueError("Each gripper is where the other one was: their order has changed. Start the run again.")
+            raise ValueError(
+                "Each gripper is at the other one's last position: their order has changed. Start the run again."
+            )
         if ends_exchanged(keypoints, near[:, :2], self.target.length):
             raise ValueError(
                 "The first keypoint is at gripper 1 and the last at gripper 0: exchange the grippers, or reverse the "
@@ -181,7 +183,7 @@ class RobotLink:
             )
             state = _told(state, behind)
         elif newer and state.status == Status.PAUSED and (old := offset - state.offset) > self.config.watchdog:
-            state = _told(state, f"Observations are {old:.3g} s old: late, or a clock was set?")
+            state = _told(state, f"Observations are {old:.3g} s old: do they arrive late, or was a clock set?")
         if newer and share >= self.config.min_seen and np.isfinite(pose).all():
             state = dataclasses.replace(state, newest=cleaned)
         elif state.newest is None:
@@ -194,7 +196,10 @@ class RobotLink:
         if not np.isfinite(pose).all():
             return "The grippers' poses are not known yet."
         if apart > 2 * self.target.length:
-            return f"The grippers are {apart:.3g} m apart, and the cable is {self.target.length:.3g} m long: metres?"
+            return (
+                f"The grippers are {apart:.3g} m apart, but the cable is {self.target.length:.3g} m long: are poses "
+                "and keypoints in metres?"
+            )
         return (
             f"{100 * share:.0f} % of the keypoints are known and within reach of the grippers, expected "
             f"{100 * self.config.min_seen:.0f} %: are they in metres, in the grippers' frame?"
@@ -230,9 +235,9 @@ class RobotLink:
             error = float(shape_error_cm(seen.keypoints, self.target.keypoints))
             state = dataclasses.replace(state, errors=(*state.errors, error)[-config.patience - 1 :])
             if len(state.errors) > config.patience and np.ptp(state.errors) <= RESTING_CM:
-                return self._held(state, Status.DONE, "The error has come to rest."), instant
+                return self._held(state, Status.DONE, "The error has settled."), instant
         if state.commands == config.steps:
-            return self._held(state, Status.DONE, f"All {config.steps} commands were given."), instant
+            return self._held(state, Status.DONE, f"All {config.steps} commands were sent."), instant
         began = time.perf_counter()
         try:
             controller, twist, info = self.controller.step(
@@ -252,7 +257,7 @@ class RobotLink:
         instant = Instant(seen, allowed, share, radius, action, spent, limited=allowed is not twist)
         state = dataclasses.replace(
             state,
-            reason="" if allowed.any() or not twist.any() else "The limits leave nothing of the controller's command.",
+            reason="" if allowed.any() or not twist.any() else "The limits reduce the controller's command to zero.",
             controller=controller,
             due=seen.time + config.interval,
             # what comes late is commanded late

@@ -27,7 +27,7 @@ class Status(enum.StrEnum):
     PAUSED = "paused"
     """The watchdog holds the grippers: the newest usable observation is too old."""
     DONE = "done"
-    """All commands were given, or the error has come to rest."""
+    """All commands were sent, or the error has settled."""
     STOPPED = "stopped"
     """Ended early; the reason says why."""
 

@@ -64,9 +64,11 @@ def run_closed_loop(
     if steps < 1 or samples < 1 or abs(samples - interval * record_hz) > 1e-9:
         raise ValueError(
             f"A run of {steps} steps with {record_hz} samples per second, in intervals of {interval} s, is not "
-            f"possible: give at least one step and a whole number of samples in an interval."
+            "possible: give at least one step, and a whole number of samples in each interval."
         )
-    require((steps + 1) * interval, "duration", "The time of a run", "A log's episode is no longer: make several runs.")
+    require(
+        (steps + 1) * interval, "duration", "The time of a run", "A log's episode cannot be longer: make several runs."
+    )
     first = plant.reset(np.asarray(start, float))
     if first.keypoints.shape != target.keypoints.shape:
         raise ValueError(

@@ -101,9 +101,9 @@ class ClosedLoopRun:
         distance = 100 * np.linalg.norm(self.keypoints[-1] - self.target.keypoints, axis=-1)
         seen, known = np.isfinite(distance), np.isfinite(self.error_cm)
         if not known.any():
-            return f"{self.target.name}: no keypoint of the cable was ever seen.{early}"
+            return f"{self.target.name}: no keypoint of the cable was ever observed.{early}"
         best = int(np.nanargmin(self.error_cm))
-        last = f"at the end {seen.sum()} of {len(seen)} keypoints were seen"
+        last = f"at the end {seen.sum()} of {len(seen)} keypoints were observed"
         if seen.any():
             far = f"keypoint {int(np.nanargmax(distance))} is farthest off, by {np.nanmax(distance):.2f} cm"
             last = far if seen.mean() >= _SEEN else f"{last}, of which {far}"

@@ -69,8 +69,8 @@ class Target:
         (low, high), (shorter, longer) = _OTHER, _coarse(len(self.keypoints))
         if not low - shorter <= self.length / length <= high + longer:
             raise ValueError(
-                f"Target {self.name!r} is {self.length:.3g} m along its keypoints, and {whose} is of a cable of "
-                f"{length:.3g} m: take one of the other's length."
+                f"Target {self.name!r} is {self.length:.3g} m long along its keypoints, but {whose} is for a cable of "
+                f"{length:.3g} m: use a target of that length."
             )
 
 

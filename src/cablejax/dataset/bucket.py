@@ -31,7 +31,7 @@ def place_of(path: str | os.PathLike[str] | Bucket) -> Path | Bucket:
     text = os.fspath(path)
     found = re.fullmatch(r"s3:/{1,2}([^/].*?)/*", text, re.IGNORECASE)
     if not found and text.lower().startswith("s3:"):
-        raise ValueError(f"{text} is no place in object storage, expected s3://BUCKET/PREFIX.")
+        raise ValueError(f"{text} is not an address in object storage, expected s3://BUCKET/PREFIX.")
     return Bucket(f"s3://{found[1]}") if found else Path(path)
 
 
@@ -122,5 +122,5 @@ class Bucket:
             reason = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
             raise UnreachableError(
                 f"{self.url} cannot be reached: {reason[:300]}. Check AWS_ENDPOINT_URL, the keys and the connection. "
-                "What was complete is kept: run the same command again to go on."
+                "Complete shards are kept: run the same command again to resume."
             ) from error

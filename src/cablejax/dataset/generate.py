@@ -118,8 +118,7 @@ def generate(
         except KeyboardInterrupt:
             raise GenerationInterrupted(
                 f"Stopped at {sum(len(config.shard_rows(shard)) for shard in done)} of {total} trajectories; they are "
-                f"kept in {path}. "
-                "Run the same generation again to go on from there."
+                f"kept in {path}. Run the same generation again to resume."
             ) from None
     if distributed:
         from jax.experimental import multihost_utils
@@ -160,7 +159,8 @@ def _check_room(store: Store) -> None:
     if needed > free:
         raise ValueError(
             f"{missing} trajectories are missing in {store.path}, which need about {needed / 1e9:.3g} GB, but its disk "
-            f"has {free / 1e9:.3g} GB left. Make room, or give a folder on another disk; what is there is kept."
+            f"has {free / 1e9:.3g} GB left. Make room, or give a folder on another disk; existing trajectories are "
+            "kept."
         )
 
 
@@ -218,8 +218,8 @@ def simulate(
             return [Block(**{name: part[i] for name, part in parts.items()}) for i in range(len(shards))]
     raise ValueError(
         f"{len(problems)} trajectories failed {MAX_ATTEMPTS} times in a row; number {rows[pending[0]]}: "
-        f"{problems[pending[0]]}. Another engine, time step or number of links may do: --engine threaded, "
-        "--timestep, --links. A soft cable on a rough table needs the first, or fewer links."
+        f"{problems[pending[0]]}. Another engine, time step or number of links may help: --engine threaded, "
+        "--timestep, --links. A soft cable on a rough table needs another engine or fewer links."
     )
 
 
@@ -260,8 +260,8 @@ def make_engine(config: DatasetConfig) -> Engine:
     threads = os.environ.get("NPROC", "")
     if devices[0].platform == "cpu" and threads.isdecimal() and int(threads) < len(devices):
         raise ValueError(
-            f"NPROC={threads} gives XLA fewer threads than there are devices ({len(devices)}), which would wait for "
-            "each other for ever: raise NPROC, or use fewer devices."
+            f"NPROC={threads} gives XLA fewer threads than there are devices ({len(devices)}), which would deadlock: "
+            "raise NPROC, or use fewer devices."
         )
     shards = 1 if devices[0].platform == "cpu" else max(CABLES_ON_ACCELERATOR // config.shard_size, 1)
     return DeviceParallel(engine, min(shards, config.n_shards) * config.shard_size, devices)

@@ -47,7 +47,7 @@ def open_store(path: str | os.PathLike[str]) -> Store:
     for name in _arrays(store.config):
         if fault := _fault(store, name):
             raise ValueError(
-                f"The data set {path} is damaged: {name} {fault}. Run the generation that began it again, which "
+                f"The data set {path} is damaged: {name} {fault}. Run the command that generated it again, which "
                 "repairs it, or generate it elsewhere."
             )
     return store
@@ -95,7 +95,7 @@ def _fault(store: Store, name: str) -> str | None:
         expected = ((store.config.n_trajectories, *shape), dtype, store.config.shard_size, 0)
         if came != expected:
             return f"has (shape, type, shard, default) {came}, expected {expected}"
-        return None if _keeps(array) else "is encoded in a way that does not give back what is written"
+        return None if _keeps(array) else "is encoded in a way that loses what is written"
     except Exception as error:  # zarr raises what its parts raise
         if isinstance(store.path, Bucket) and not isinstance(error, (FileNotFoundError, ValueError, KeyError)):
             with store.path.reached():
@@ -132,7 +132,7 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
         raise ValueError(f"{place} is a file, expected a folder to write a data set to. Give another place.")
     elif place.is_dir() and any(place.iterdir()) and not (place / "zarr.json").is_file():
         raise ValueError(
-            f"{place} exists and holds no data set but other files. Give an empty or new folder; nothing was changed."
+            f"{place} exists and holds files other than a data set. Give an empty or new folder; nothing was changed."
         )
     elif not place.is_dir() or not any(place.iterdir()):
         _create(place, config, versions)
@@ -140,13 +140,13 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
     changes = _changes(store.recorded, config_to_json(config))
     if changes:
         raise ValueError(
-            f"{place} holds a data set of another configuration: {changes}. "
-            "Give another folder, or the configuration that the store was begun with. Nothing was changed."
+            f"{place} holds a data set of another configuration: {changes}. Give another folder, or the configuration "
+            "with which it was begun. Nothing was changed."
         )
     changes = _changes(store.versions, versions)
     if changes and not store.info().complete:
         raise ValueError(
-            f"{place} was begun with other packages: {changes}. Trajectories of two versions are not mixed: "
+            f"{place} was begun with other packages: {changes}. Trajectories of different versions cannot be mixed: "
             "install those versions, or generate in another folder. Nothing was changed."
         )
     faulty = [name for name in _arrays(config) if _fault(store, name)]
@@ -202,7 +202,7 @@ def _create_in_bucket(bucket: Bucket, config: DatasetConfig, versions: dict[str,
     if bucket.read("zarr.json") is not None:
         return
     if any(not name.endswith("/zarr.json") for name in bucket.names()):
-        raise ValueError(f"{bucket} holds something, but no data set. Give a new prefix; nothing was changed.")
+        raise ValueError(f"{bucket} holds objects, but no data set. Give a new prefix; nothing was changed.")
     descriptions = _descriptions(config, versions)
     for name in sorted(descriptions, key=lambda name: name == "zarr.json"):
         bucket.write(name, descriptions[name])

@@ -57,8 +57,8 @@ def read_split(
         complete, cable = digest.any(axis=1), store.config.cable
         if not complete.all():
             raise ValueError(
-                f"{store.path} holds {complete.sum()} of {store.config.n_trajectories} trajectories. "
-                "Complete it first: run the command that began it again."
+                f"{store.path} holds {complete.sum()} of {store.config.n_trajectories} trajectories. Complete it "
+                "first: run the command that generated it again."
             )
         came = (cable.n_keypoints, cable.length, store.config.n_steps, store.config.interval)
         expected = (first.cable.n_keypoints, first.cable.length, first.n_steps, first.interval)
@@ -77,7 +77,8 @@ def read_split(
         if buffer < 2 * size:
             raise ValueError(
                 f"A buffer of {buffer} trajectories is too small: data come in blocks of {size}, the size of a shard, "
-                f"and at least two are in memory. Give at least {2 * size}, or none: all are read then."
+                f"and at least two are in memory. Give at least {2 * size}, or leave the buffer out to read all at "
+                "once."
             )
         return StreamedData(tuple(stores), blocks_of(training, size), buffer // size, seed), rest
     return concatenate([read_trajectories(store, mine) for store, mine in zip(stores, training, strict=True)]), rest
@@ -94,6 +95,6 @@ def _check_apart(
         for other, there in zip(stores, trained, strict=True):
             if (both := np.isin(name[last], there)).any():
                 raise ValueError(
-                    f"{both.sum()} of the {len(last)} trajectories that are held out of {store.path} are among those "
-                    f"to train on in {other.path}: simulate one of the two with another --seed."
+                    f"{both.sum()} of the {len(last)} trajectories held out of {store.path} are training trajectories "
+                    f"of {other.path}: simulate one of the two with another --seed."
                 )

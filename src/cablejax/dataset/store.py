@@ -179,7 +179,7 @@ class Store:
             return cast(zarr.Array, self.group[name])
         except KeyError:
             raise ValueError(
-                f"{self.path} has no {name} any more: was it removed? Begin again in another folder."
+                f"{self.path} no longer has {name}: was it removed? Start again in another folder."
             ) from None
 
     def _load(self, name: str, rows: slice) -> np.ndarray:

@@ -35,11 +35,13 @@ def starting_from(source: str | os.PathLike[str], config: ModelConfig) -> tuple[
     if same != trained or trained.conditioned > config.conditioned or config.symmetric > trained.symmetric:
         pairs = [(f.name, getattr(trained, f.name), getattr(config, f.name)) for f in dataclasses.fields(config)]
         other = [
-            f"{name} is {_short(there)} there and {_short(here)} here" for name, there, here in pairs if there != here
+            f"{name} is {_short(there)} in that model and {_short(here)} here"
+            for name, there, here in pairs
+            if there != here
         ]
         raise ValueError(
-            f"The model to start from differs: {'; '.join(other)}. Only `conditioned` may be added, and `symmetric` "
-            "left out. Train with the settings of that model."
+            f"The model to start from has other settings: {'; '.join(other)}. Only adding `conditioned` and dropping "
+            "`symmetric` are allowed. Train with the settings of that model."
         )
     flat = dict(nnx.to_flat_state(weights))
     kernel, bias = (flat["node_encoder", "first", 0, name] for name in ("kernel", "bias"))

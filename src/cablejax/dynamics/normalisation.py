@@ -40,8 +40,8 @@ def check_trajectories(data: Trajectory, config: ModelConfig, *, steps: int, wha
     cable = None if data.cable is None else np.shape(data.cable)
     if config.conditioned and cable != (m, 2):
         raise ValueError(
-            f"{what} has cable {cable}, but a conditioned model is trained on what is known of every "
-            f"cable: expected ({m}, 2), see `cablejax.types.cable_descriptor`."
+            f"{what} has cable {cable}, but a conditioned model is trained with a descriptor of every cable: expected "
+            f"({m}, 2), see `cablejax.types.cable_descriptor`."
         )
     for name in ("keypoints", "gripper_pose", "gripper_twist"):
         bad = ~np.isfinite(np.asarray(getattr(data, name))).all(axis=(1, 2, 3))

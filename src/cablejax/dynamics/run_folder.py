@@ -55,8 +55,9 @@ def claim_folder(
             if others := differences(began, versions):
                 changes = ", ".join(f"{name} ({old}, now {new})" for name, (old, new) in others.items())
                 report(
-                    f"{out_dir} was begun with other packages: {changes}. The training goes on, but its "
-                    "weights may differ by rounding from those of one version; install the former to repeat them."
+                    f"{out_dir} was begun with other packages: {changes}. The training continues, but its weights may "
+                    "differ by rounding from those of a single version; install the earlier versions to reproduce "
+                    "these exactly."
                 )
             return
         if not overwrite:
@@ -69,8 +70,8 @@ def claim_folder(
     elif out_dir.is_dir() and holds_anything(out_dir):
         if not overwrite:
             raise ValueError(
-                f"{out_dir} exists and is not empty, and holds no training. Choose another folder, or write among what "
-                "is there (--overwrite)."
+                f"{out_dir} exists and is not empty, and holds no training. Choose another folder, or write among its "
+                "files (--overwrite)."
             )
         for name in (CHECKPOINTS, BOARD):
             if (out_dir / name).exists():
@@ -88,7 +89,8 @@ def _read(path: Path) -> dict[str, Any]:
         found = read_json(path)
     except ValueError as error:
         raise ValueError(
-            f"{error} It is unknown which training {path.parent} holds: choose another folder, or delete this one."
+            f"{error} The configuration of the training in {path.parent} is therefore unknown: choose another folder, "
+            "or delete this one."
         ) from error
     if not isinstance(found, dict) or not {"config", "data"} <= found.keys():
         raise ValueError(f"{path} was not made by a training: choose another folder.")

@@ -156,13 +156,13 @@ def _open(source: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
     if path.is_dir():
         path = path / FILE_NAME
         if not path.is_file():
-            raise WeightsError(f"{path.parent} holds no {FILE_NAME}: is its training complete? Run it again to go on.")
+            raise WeightsError(f"{path.parent} holds no {FILE_NAME}: is its training complete? Run it again to resume.")
     elif not path.is_file():
         if path.suffix or len(path.parts) != 1:
             raise WeightsError(f"There is no weights file {path}. Train one with `cablejax train`.")
         path = _released(str(source))
     try:
-        require(path.stat().st_size, "array_bytes", f"The size of {path}", "Are these the weights that are meant?")
+        require(path.stat().st_size, "array_bytes", f"The size of {path}", "Are these the intended weights?")
     except ValueError as error:
         raise WeightsError(str(error)) from None
     try:

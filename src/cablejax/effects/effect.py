@@ -112,7 +112,7 @@ class Effect:
             if parameter.log and null in (0.0, math.inf):
                 raise ValueError(
                     f"Effect {self.name!r} is reversible, but its parameter {parameter.name!r} is positive and has the "
-                    f"null value {null}: it has no opposite. Leave reversible out."
+                    f"null value {null}: its opposite does not exist. Leave reversible out."
                 )
         if not self.variants:
             raise ValueError(f"Effect {self.name!r} has no variant, expected one at least: variants=(0,).")

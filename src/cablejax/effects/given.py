@@ -144,7 +144,7 @@ def with_effects(physics: Physics, effects: Iterable[GivenEffect], chain: Discre
     for one, other in itertools.combinations(ordered, 2):
         if one.name == other.name and one.effect.alone and one.meets(other):
             raise ValueError(
-                f"{one.name} is given twice ({one}; {other}), and a simulation has one at a time: leave one out."
+                f"{one.name} is given twice ({one}; {other}), but a simulation has each effect once: leave one out."
             )
     for effect in ordered:
         physics = effect.applied(physics, chain)

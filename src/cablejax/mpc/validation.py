@@ -65,7 +65,7 @@ def check_reach(length: float, history: History) -> None:
     apart = float(np.linalg.norm(np.asarray(pose[0, :2] - pose[1, :2])))
     if apart > _FAR * length:
         raise ValueError(
-            f"The grippers are {apart:.3g} m apart, and the cable is {length:g} m long (`MPCConfig.for_length`): "
+            f"The grippers are {apart:.3g} m apart, but the cable is {length:g} m long (`MPCConfig.for_length`): "
             "expected poses and keypoints in metres."
         )
 

@@ -73,8 +73,8 @@ class CameraConfig:
         )
         if not 0 <= self.tilt <= 1.2:
             raise ValueError(
-                f"CameraConfig.tilt is {self.tilt} rad, expected 0 (straight above) to 1.2: a flatter view does not "
-                "show the table."
+                f"CameraConfig.tilt is {self.tilt} rad, expected 0 (straight above) to 1.2: a flatter view cannot show "
+                "the table."
             )
         if min(self.resolution) < 2 or min(self.gripper_size) <= 0:
             raise ValueError(

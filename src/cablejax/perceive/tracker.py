@@ -193,7 +193,7 @@ def _checked_pose(value: Float[np.ndarray, "Q 3"]) -> np.ndarray:
     pose = np.asarray(value, float)
     if pose.shape != (2, 3) or not np.isfinite(pose).all():
         raise ValueError(
-            f"gripper_pose is {pose.tolist()}, expected two finite rows (x, y, theta): without the grippers' poses "
-            "the place of the cable along itself cannot be known."
+            f"gripper_pose is {pose.tolist()}, expected two finite rows (x, y, theta): without the grippers' poses, "
+            "the arc length of the points is unknown."
         )
     return pose

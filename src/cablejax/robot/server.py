@@ -122,7 +122,7 @@ def _message(line: bytes, simulated_clock: bool) -> Observation | float:
         require(content["now"], "stamp", '"now"')
         return float(content["now"])
     if not isinstance(content, dict) or not {"time", "keypoints", "gripper_pose"} <= set(content):
-        raise ValueError('A message is no object with "time", "keypoints" and "gripper_pose".')
+        raise ValueError('A message is not an object with "time", "keypoints" and "gripper_pose".')
     require(content["time"], "stamp", '"time"', "Is it in seconds?")
     try:
         keypoints, pose = (

@@ -68,7 +68,7 @@ class RobotRun:
                 fault = str(error)
             if fault:
                 self.log.forget_command()
-                return self.stop(now, f"What was observed so far is not a cable between these grippers: {fault}")
+                return self.stop(now, f"The observations so far do not show a cable between these grippers: {fault}")
         return reply
 
     def stop(self, now: float, reason: str) -> Reply:
@@ -83,7 +83,7 @@ class RobotRun:
             GapLogError: nothing usable was observed; or the recording violates the format, and its samples are written.
         """
         if not self.log.recorded:
-            raise GapLogError(f"There is no log: nothing usable was observed. {self._state.reason}".strip())
+            raise GapLogError(f"No log was written: nothing usable was observed. {self._state.reason}".strip())
         path, count = self.path, itertools.count(2)
         while path.exists() or path.with_suffix(_RAW).exists():
             path = self.path.with_stem(f"{self.path.stem}_{next(count)}")
@@ -95,7 +95,9 @@ class RobotRun:
             arrays = {f"{name}_{k}": array for k, (_, episode) in pieces for name, array in vars(episode).items()}
             with whole_file(kept) as stream:
                 np.savez_compressed(stream, allow_pickle=False, **arrays)
-            raise GapLogError(f"The recording is no gap log, and its samples are kept in {kept}: {error}") from None
+            raise GapLogError(
+                f"The recording is not a valid gap log: {error} Its samples are kept in {kept}."
+            ) from None
 
     def _recorded(self) -> GapLog:
         return self.log.gap_log(self.link.target, self.cable, self.source)

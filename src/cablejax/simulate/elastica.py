@@ -135,9 +135,9 @@ def solve_elastica(
             return shapes[-1]
     if not shapes:
         raise ElasticaError(
-            f"No equilibrium found for end angles {ends[0]:.3f} and {ends[1]:.3f} rad against the chord and a "
-            f"chord of {ends[2]:.3f} lengths: ends that turn so far so close together have none that grows "
-            "out of a straight cable. Choose gentler ends or pass a guess."
+            f"No equilibrium found for end angles {ends[0]:.3f} and {ends[1]:.3f} rad against the chord and a chord of "
+            f"{ends[2]:.3f} lengths: with such large end angles so close together, no equilibrium can be reached "
+            "continuously from a straight cable. Choose smaller angles or pass a guess."
         )
     return shapes[0]
 

@@ -140,9 +140,9 @@ def _warn_if_taut(engine: Engine, physics: Physics, state: CableState, twist: An
     reach = np.linalg.norm(chord[..., : engine.config.dimension], axis=-1).max()
     if reach > engine.config.cable.length * (1 - _TAUT):
         warnings.warn(
-            f"The grippers are commanded {reach:.4f} m apart and the cable is {engine.config.cable.length:g} m long: "
-            "it is taut, or its ends will leave the grippers, and where it goes and derivatives mean nothing there. "
-            "Bring the grippers closer.",
+            f"The grippers are commanded {reach:.4f} m apart but the cable is {engine.config.cable.length:g} m long: "
+            "it is taut, or its ends leave the grippers, so its motion and derivatives are meaningless. Bring the "
+            "grippers closer.",
             stacklevel=4,
         )
 

@@ -80,7 +80,8 @@ def find_equilibrium(
         return _taut(config, pose)
     if config.n_links < FEWEST_LINKS:
         raise ValueError(
-            f"A chain of {config.n_links} links has no freedom between two grippers, expected at least {FEWEST_LINKS}."
+            f"A chain of {config.n_links} links cannot move between two grippers, expected at least {FEWEST_LINKS} "
+            "links."
         )
     angles, stability, off = settle(link_lengths(config), pose, np.array(guess, np.float64))
     if np.isnan(stability):

@@ -40,8 +40,8 @@ def play(plant: TablePlant, log: GapLog, *, source: str, noise: float = 0.0, see
     gravity = np.asarray(log.meta["gravity_m_per_s2"], float)
     if np.abs(gravity[:2]).max() > 1e-6:
         raise ValueError(
-            f"The motion states gravity as {gravity.tolist()} m/s^2, and the plant's table is level: state "
-            "[0, 0, -9.81] in meta.gravity_m_per_s2 of both logs, and give the tilt as an effect, gravity_tilt."
+            f"The motion states gravity as {gravity.tolist()} m/s^2, but the plant's table is level: state [0, 0, "
+            "-9.81] in meta.gravity_m_per_s2 of both logs, and give the tilt as an effect, gravity_tilt."
         )
     episodes, random = [], np.random.default_rng(seed)
     for e, length in enumerate(log.episode_length):

@@ -203,8 +203,8 @@ class TablePlant(abc.ABC):
         if not stable:
             time, self._steps_done = self.time, None  # nothing but a reset makes sense now
             raise PlantError(
-                f"The plant's simulation became unstable at {time:.3f} s: with fewer links, a shorter "
-                f"timestep than {dt} s, or gentler commands it may stay stable."
+                f"The plant's simulation became unstable at {time:.3f} s: try fewer links, a shorter timestep than "
+                f"{dt} s, or slower commands."
             )
 
     def _check_distance(self, pose: np.ndarray, length: float) -> None:

@@ -46,7 +46,7 @@ class ChainEngine(Engine):
     def __post_init__(self):
         if self.config.dimension != 2:
             raise ValueError(
-                f"ChainEngine simulates cables in the plane, and the discretisation has dimension "
+                "ChainEngine simulates cables in the plane, but the discretisation has dimension "
                 f"{self.config.dimension}. Use MjxEngine or ThreadedEngine for a cable in space."
             )
 

@@ -61,8 +61,8 @@ class PlantConfig(ObservedConfig):
         remembered = [effect.name for effect in self.effects if effect.effect.hook == "memory"]
         if remembered and not all(effect.lasting for effect in self.effects):
             raise ValueError(
-                f"{remembered[0]} acts all the time and another effect does not: the plant's memory of bends would be "
-                "lost where that begins or ends. Leave out from_s and until_s, or this effect."
+                f"{remembered[0]} acts during the whole run, but another effect does not: the plant would lose its "
+                "memory of bends when that effect begins or ends. Leave out from_s and until_s, or this effect."
             )
         radius, own = float(self.physics.obstacle_radius), self.cable.diameter / 2
         if 0 < radius <= own:
