@@ -94,7 +94,7 @@ def test_what_is_named_beside_an_unknown_cause_is_added_with_a_warning(tmp_path,
     path = tmp_path / "verdict.json"
     path.write_text(json.dumps(verdict))
     assert list(map(str, Simulate(with_=(path,)).dataset_config().effects)) == ["bending_stiffness:ratio=1.5"]
-    assert "beside a cause that it does not know; of such effects about 27 % are causes" in capsys.readouterr().err
+    assert "together with an unknown cause; about 27 % of such effects are causes" in capsys.readouterr().err
     path.write_text(json.dumps({**verdict, "verdict": "maybe"}))
     with pytest.raises(ValueError, match=r"verdict is 'maybe', expected none, named, ambiguous"):
         Simulate(with_=(path,)).dataset_config()

@@ -114,8 +114,8 @@ def check_verdicts(paths: Sequence[pathlib.Path], cable: Cable, remedy: str) -> 
             raise ValueError(f"{path}: verdict is {shown(word)}, expected {', '.join(get_args(Verdict))}.")
         if word == "named+unknown":
             say(
-                f"{path} names an effect beside a cause that it does not know; of such effects about "
-                f"{100 * BESIDE_UNKNOWN:.0f} % are causes. It is added all the same."
+                f"{path} names an effect together with an unknown cause; about {100 * BESIDE_UNKNOWN:.0f} % of such "
+                "effects are causes. The effect is added nevertheless."
             )
         if (theirs := cable_of_verdict(path)) is None:
             continue
