@@ -72,7 +72,7 @@ def test_what_is_known_of_a_cable_has_its_effects(tmp_path):
     ],
 )
 def test_a_training_flips_what_is_as_likely_and_takes_no_camera(tmp_path, text, asymmetric, camera):
-    config = dataclasses.replace(STAGED, effects=(parse_effect(text),))
+    config = dataclasses.replace(STAGED, effects=(parse_effect(text),), interval=0.5)
     assert (config.asymmetric, config.camera_effects) == (asymmetric, camera)
     generate(config, tmp_path / "data", progress=False)
     training = Train(data=(tmp_path / "data",), out=tmp_path / "out", preset="smoke", prior="rigid")
@@ -80,7 +80,8 @@ def test_a_training_flips_what_is_as_likely_and_takes_no_camera(tmp_path, text, 
         with pytest.raises(ValueError, match="camera_lag: its keypoints are not where the cable is"):
             training.execute()
     else:
-        training.execute()
+        _, table = training.execute()
+        assert table.partition("\n")[0].endswith(" 0.5 s"), "the only horizon, of one command"
         made = json.loads((tmp_path / "out" / "run.json").read_text())
         assert made["config"]["flips"] is not bool(asymmetric)
 

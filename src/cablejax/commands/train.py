@@ -113,7 +113,7 @@ class Train(Command):
         write_json(self.out / "summary.json", summary)
         errors = report.errors["all windows"]
         table = text_table(
-            ["open-loop error [cm] after", *(f"{h} s" for h in errors["network"].horizons)],
+            ["open-loop error [cm] after", *(f"{h * result.model.interval:g} s" for h in errors["network"].horizons)],
             [
                 [f"{name}, {kind}", *(f"{e:.4f}" for e in getattr(error, f"{kind}_cm"))]
                 for kind in ("median", "rmse")
