@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.diagnose.motion_bounds import Bounds, cable_beyond, curvature, grippers_beyond, read_bounds, refined
+from cablejax.diagnose.motion_bounds import (
+    Bounds,
+    _near_snapping,
+    cable_beyond,
+    curvature,
+    grippers_beyond,
+    read_bounds,
+    refined,
+)
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions
 
 CONFIG = Discretisation(n_links=17)
@@ -132,6 +140,21 @@ def test_way_through_a_snap_is_found():
     share = np.linspace(0, 1, 300)[:, None, None]
     poses = ARCH * [0.8, 1, 1] * (1 - share) + ARCH * [0.8, 1, -3.5] * share
     assert list(grippers_beyond(Bounds(), CONFIG, poses, INTERVAL)) == ["snap_through"]
+
+
+def test_snapping_does_not_depend_on_the_size_of_the_cable():
+    """A gripper that only turns: its way is compared with the cable's, which is as much longer as the cable is."""
+    begin, end = (np.array([[0.0, 0.0, angle], [0.87, 0.0, -0.17]]) for angle in (0.17, -1.05))
+    found = []
+    for length in (0.2, 1.0, 3.0):
+        config = Discretisation(Cable(length=length, diameter=0.01 * length), n_links=17)
+        poses = np.linspace(begin, end, 101) * [length, length, 1.0]
+        points = np.linspace(poses[:, 0, :2], poses[:, 1, :2], 13, axis=1)
+        points[50:, 3:-3, 1] += 0.02 * length
+        simulated = cable_beyond(Bounds(), config, poses, points[None])
+        found.append([_near_snapping(config, poses), simulated["snap_through"]])
+    np.testing.assert_allclose(found, found[1:2] * 3, rtol=1e-3)
+    assert min(found[1]) > 0 and max(found[1]) < 10
 
 
 def test_angles_that_need_more_cable_are_out_of_reach():

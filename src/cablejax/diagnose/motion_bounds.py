@@ -33,7 +33,7 @@ _SPACING = 5
 _PLANNED = 0.8
 # Grippers that moved within this time may still move a cable that friction held [samples].
 _RECENT = 10
-# So slow, in one sample, that it counts as rest [m].
+# So slow, in one sample, that it counts as rest, in lengths of the cable: whether it snaps does not depend on its size.
 _REST = 1e-3
 _ROUNDING = 1e-6
 
@@ -214,9 +214,9 @@ def cable_beyond(
     if margin > 0:
         least, most = least * 1.1, most * _PLANNED
     step = np.linalg.norm(np.diff(keypoints, axis=1), axis=-1).max(axis=-1)
-    sizes = np.linalg.norm(np.diff(poses, axis=0) * [1.0, 1.0, ROTATION_WEIGHT], axis=-1).sum(axis=-1)
+    sizes = np.linalg.norm(np.diff(poses, axis=0) * [1.0, 1.0, ROTATION_WEIGHT * length], axis=-1).sum(axis=-1)
     recent = np.lib.stride_tricks.sliding_window_view(np.pad(sizes, (_RECENT, 0)), _RECENT + 1).max(axis=-1)
-    jump = float((step / np.maximum(recent, _REST)).max(initial=0.0))
+    jump = float((step / np.maximum(recent, _REST * length)).max(initial=0.0))
     return _those_broken(
         {
             **_beyond_places(bounds, lines, margin + 0.5 * config.cable.diameter, length),
@@ -279,7 +279,7 @@ def _near_snapping(config: Discretisation, poses: Float[np.ndarray, "T 2 3"]) ->
 
     Both are relative, and nothing above 10; 0 where neither happens.
     """
-    most, least, before = 0.0, np.inf, None
+    most, least, before, length = 0.0, np.inf, None, config.cable.length
     angles = arch_angles(config, poses[0])
     for pose in poses[::_SPACING]:
         try:
@@ -289,9 +289,9 @@ def _near_snapping(config: Discretisation, poses: Float[np.ndarray, "T 2 3"]) ->
         angles, least = rest.angles, min(least, rest.stability / config.n_links)
         nodes = chain_nodes(config, pose, angles)
         if before is not None:
-            size = np.linalg.norm((pose - before[1]) * [1.0, 1.0, ROTATION_WEIGHT], axis=-1).sum()
+            size = np.linalg.norm((pose - before[1]) * [1.0, 1.0, ROTATION_WEIGHT * length], axis=-1).sum()
             moved = np.linalg.norm(nodes - before[0], axis=-1).max()
-            most = max(most, float(moved / max(size, 2 * _REST)))
+            most = max(most, float(moved / max(size, 2 * _REST * length)))
         before = nodes, pose
     return min(max(most / (_PLANNED * AMPLIFICATION) - 1, 1 - least / STABILITY, 0.0), 10.0)
 
