@@ -14,6 +14,7 @@ from cablejax.commands.study import finished_rounds, remove_rounds
 from cablejax.control.targets import make_target, straight_start
 from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, Ranked
 from cablejax.diagnose.motion_bounds import Bounds
+from cablejax.diagnose.motion_file import commands_log
 from cablejax.diagnose.safe_motions import there_and_back
 from cablejax.diagnose.study import ended, first_recording, left_open
 from cablejax.diagnose.verdict_json import read_verdict, write_verdict
@@ -145,6 +146,33 @@ def test_damaged_rounds_are_made_again_and_those_of_an_earlier_study_deleted(tmp
     assert finished_rounds(state) == 1 and "Round 2 was kept, but is damaged" in capsys.readouterr().err
     remove_rounds(tmp_path, 1)
     assert {path.name for path in tmp_path.iterdir()} == {"parts", "recording_1.npz", "round_1"}
+
+
+def test_a_study_that_goes_on_with_fewer_rounds_keeps_none_beyond_them(tmp_path, monkeypatch):
+    begun, commands = [], commands_log({"U": np.repeat(straight_start(LONG)[None], 20, axis=0)}, 0.1, LONG)
+
+    def play(_, commands, **__):
+        if len(begun) == 2:
+            raise KeyboardInterrupt
+        begun.append(commands)
+        return commands
+
+    def diagnosed(log, folder, **_):
+        write_verdict(folder / "verdict.json", found("ambiguous", 0.1))
+        write_gap_log(folder / "next_motion.npz", log)
+        return found("ambiguous", 0.1), folder / "report.html"
+
+    monkeypatch.setattr("cablejax.diagnose.study.first_recording", lambda *_: commands)
+    monkeypatch.setattr("cablejax.simulate.play.play", play)
+    monkeypatch.setattr("cablejax.gaplog_join.joined", lambda recordings, _: recordings[-1])
+    monkeypatch.setattr("cablejax.commands.diagnose.diagnose_and_report", diagnosed)
+    monkeypatch.setattr("cablejax.diagnose.study.ended", lambda *_, rounds_left: None if rounds_left else "rounds")
+    study = ["study", "--out", str(tmp_path), "--links", "16", "--rounds"]
+    assert main([*study, "3"]) == 130 and (tmp_path / "round_2").exists()
+    assert main([*study, "1"]) == 0
+    assert len(json.loads((tmp_path / "summary.json").read_text())["rounds"]) == 1
+    kept = {path.name for path in tmp_path.iterdir()}
+    assert kept == {"recording_1.npz", "report.html", "round_1", "summary.json"}
 
 
 @pytest.mark.slow

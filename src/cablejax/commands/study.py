@@ -109,6 +109,8 @@ class Study(Command):
                 why = ended(found[-1], worth, rounds_left=self.rounds - number)
                 if why is None:
                     commands = read_gap_log(folder / "next_motion.npz")
+            # more of them are kept where --rounds was larger
+            remove_rounds(self.out, number)
             motions = [log.meta["motion"] for log in recordings]
             page = write_sheet(self.out / "report.html", study_sheet(found, motions, why, config.effects))
             result = {
@@ -152,7 +154,7 @@ def finished_rounds(state: pathlib.Path) -> int:
 
 
 def remove_rounds(out: pathlib.Path, kept: int) -> None:
-    """Deletes all rounds after those that are kept, of an overwritten or damaged study."""
+    """Deletes all rounds after those that are kept, of an overwritten, damaged or longer study."""
     for old in ("report.html", "summary.json"):
         (out / old).unlink(missing_ok=True)
     for path in (*out.glob("recording_*.npz"), *out.glob("round_*")):
