@@ -156,6 +156,10 @@ def test_what_does_not_enter_a_model_is_refused_with_what_to_do(model, tmp_path,
         knowing(model, (parse_effect("viscous_drag:coefficient_n_s_per_m2=2"),))
     with pytest.raises(ValueError, match=r"camera_lag:time_s=0.3.*Correct the camera"):
         knowing(model, (parse_effect("camera_lag:time_s=0.3"),))
+    with pytest.raises(
+        ValueError, match=r"actuation_gain:gain=0.8: a model is of the cable.*poses of arms are measured"
+    ):
+        knowing(model, (parse_effect("actuation_gain:gain=0.8"),))
     words = ["shape", "--out", str(tmp_path / "run"), "--effect", "bending_stiffness:ratio=0.3", "--steps", "1"]
     assert main(words) == 2
     assert "such as gns-conditioned" in capsys.readouterr().err

@@ -64,20 +64,21 @@ def test_what_is_known_of_a_cable_has_its_effects(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "asymmetric", "camera"),
+    ("text", "asymmetric", "outside"),
     [
         ("table_friction:coefficient=0.5", (), ()),
         ("stiffness_profile:centre_m=0.3,width_m=0.3,ratio=0.3", ("stiffness_profile",), ()),
         ("camera_lag:time_s=0.5", ("camera_lag",), ("camera_lag",)),
+        ("actuation_gain:gain=0.8", (), ("actuation_gain",)),
     ],
 )
-def test_a_training_flips_what_is_as_likely_and_takes_no_camera(tmp_path, text, asymmetric, camera):
+def test_a_training_flips_what_is_as_likely_and_is_of_the_cable_alone(tmp_path, text, asymmetric, outside):
     config = dataclasses.replace(STAGED, effects=(parse_effect(text),), interval=0.5)
-    assert (config.asymmetric, config.camera_effects) == (asymmetric, camera)
+    assert (config.asymmetric, config.untrainable) == (asymmetric, outside)
     generate(config, tmp_path / "data", progress=False)
     training = Train(data=(tmp_path / "data",), out=tmp_path / "out", preset="smoke", prior="rigid")
-    if camera:
-        with pytest.raises(ValueError, match="camera_lag: its keypoints are not where the cable is"):
+    if outside:
+        with pytest.raises(ValueError, match=rf"{outside[0]}\. A model is of the cable itself.*camera and of the arms"):
             training.execute()
     else:
         _, table = training.execute()

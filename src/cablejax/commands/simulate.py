@@ -81,9 +81,9 @@ class Simulate(Command):
         if self.overwrite:
             _clear(place, config)
         say(f"{config.n_trajectories} trajectories of {config.n_steps} steps into {place}")
-        if config.camera_effects:
-            moved = ", ".join(config.camera_effects)
-            say(f"With {moved} keypoints are not where the cable is: no model can be trained on them.")
+        if config.untrainable:
+            names = ", ".join(config.untrainable)
+            say(f"No model can be trained on data with {names}: it learns the cable, not its camera or its arms.")
         begin = time.perf_counter()
         info = generate(config, place, process_index=self.process_index, process_count=self.process_count)
         seconds = time.perf_counter() - begin
@@ -95,7 +95,7 @@ class Simulate(Command):
             "seconds": round(seconds, 3),
         }
         made = f"{info.n_complete} of {config.n_trajectories} trajectories are in {place} ({seconds:.0f} s)."
-        ready = info.n_complete == config.n_trajectories and not config.camera_effects
+        ready = info.n_complete == config.n_trajectories and not config.untrainable
         return result, f"{made}\nTrain on them: cablejax train --data {place}" if ready else made
 
     def dataset_config(self) -> DatasetConfig:

@@ -140,10 +140,11 @@ class Train(Command):
                 "Simulate a cable with `keypoints = N` in place of keypoint_arclength_m."
             )
         for store in stores:
-            if camera := store.config.camera_effects:
+            if outside := store.config.untrainable:
                 raise UsageError(
-                    f"{store.path} has {', '.join(camera)}: its keypoints are not where the cable is. A model is of "
-                    "the cable itself: simulate without the camera's effects."
+                    f"{store.path} has {', '.join(outside)}. A model is of the cable itself: it takes the keypoints as "
+                    "points of the cable and every command as executed exactly, and a controller measures the poses "
+                    "that the grippers reach. Simulate without effects of the camera and of the arms."
                 )
         for store in stores[1:]:
             if other := differing(store.config.cable, first.config.cable):

@@ -20,7 +20,7 @@ from cablejax.dynamics.bfloat16_slopes import with_bfloat16_slopes
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply, structure_of
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights
-from cablejax.effects import CAMERA
+from cablejax.effects import OUTSIDE
 from cablejax.effects.given import GivenEffect, with_effects
 from cablejax.effects.physics import mean_resistance, nominal_physics
 from cablejax.limits import shown
@@ -126,12 +126,11 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
         ValueError: nothing of the effects enters the model; names the ways that remain.
     """
     if effects and not enters(model, effects):
-        if all(effect.name in CAMERA for effect in effects):
-            raise ValueError(
-                f"{', '.join(map(str, effects))}: no model knows of the camera. Correct the camera, or the recording."
-            )
+        names = ", ".join(map(str, effects))
+        if all(effect.name in OUTSIDE for effect in effects):
+            raise ValueError(f"{names}: a model is of the cable. Correct the camera; poses of arms are measured.")
         raise ValueError(
-            f"Nothing of {', '.join(map(str, effects))} enters the model {model.name}: neither the rest of its cable, "
+            f"Nothing of {names} enters the model {model.name}: neither the rest of its cable, "
             "nor stiffness and friction of a conditioned model, such as gns-conditioned. Simulate data with it "
             "(`cablejax simulate --with`) and train on them (`cablejax train --start-from`)."
         )

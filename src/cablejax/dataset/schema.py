@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.effects import CAMERA
+from cablejax.effects import OUTSIDE
 from cablejax.effects.given import EFFECTS, GivenEffect, with_effects
 from cablejax.effects.physics import nominal_physics
 from cablejax.limits import LIMITS, check, shown
@@ -121,9 +121,9 @@ class DatasetConfig:
         return (*names, *(["rest_curvature_per_m"] if self.cable.rest_curvature else []))
 
     @property
-    def camera_effects(self) -> tuple[str, ...]:
-        """The effects that move the keypoints off the cable."""
-        return tuple(sorted(self.effect_names & CAMERA))
+    def untrainable(self) -> tuple[str, ...]:
+        """The effects on which no model is trained, see `effects.OUTSIDE`."""
+        return tuple(sorted(self.effect_names & OUTSIDE))
 
     @property
     def effect_names(self) -> frozenset[str]:

@@ -45,7 +45,8 @@ LIBRARY: tuple[CableEffect, ...] = (
 ARMS: tuple[CableEffect, ...] = (ActuationGain(), ActuationLag())
 """Effects of the arms. A diagnosis finds them from commands and encoders, see `cablejax.diagnose.actuation`."""
 
-CAMERA = frozenset({CameraSimilarity.name, CameraLag.name})
-"""Names of those with which keypoints are not where the cable is: no model is trained on them, or informed of them."""
+OUTSIDE = frozenset({CameraSimilarity.name, CameraLag.name, *(effect.name for effect in ARMS)})
+"""Names of those outside of the cable: of the camera, with which keypoints are not where the cable is, and of the arms,
+with which commands are not executed exactly. No model is trained on them, or informed of them."""
 
-__all__ = ["ARMS", "CAMERA", "LIBRARY", "CableEffect", "Context", "Effect", "Hook", "Parameter"]
+__all__ = ["ARMS", "LIBRARY", "OUTSIDE", "CableEffect", "Context", "Effect", "Hook", "Parameter"]

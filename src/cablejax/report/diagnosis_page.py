@@ -12,7 +12,7 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
 from cablejax.diagnose.judgement import FAINT, effect_title, in_its_place, listed, share
 from cablejax.diagnose.verdict_json import write_verdict
-from cablejax.effects import CAMERA
+from cablejax.effects import OUTSIDE
 from cablejax.gaplog import SIMULATED, write_gap_log
 from cablejax.report import diagnosis_sections as sections
 from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
@@ -118,7 +118,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         label = explained_label(diagnosis) if diagnosis.explained is not None and diagnosis.effects else ""
         orbit = {"data": json_script(orbit_data(diagnosis)), "explained": label}
     path = out / PAGE
-    named = {effect.name for effect in diagnosis.effects}
+    named, addable = {effect.name for effect in diagnosis.effects}, sections.addable(diagnosis) and not space
     write_html(
         path,
         "diagnosis.html",
@@ -131,8 +131,8 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         works=_works(diagnosis),
         pictures=inline,
         orbit=orbit,
-        in_data=sections.addable(diagnosis) and named.isdisjoint(CAMERA),
-        informs=not named.isdisjoint(INFORMING),
+        trainable=addable and named.isdisjoint(OUTSIDE),
+        informs=addable and not named.isdisjoint(INFORMING),
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
         where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,
         effects=sections.named_effects(diagnosis),
