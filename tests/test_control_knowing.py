@@ -29,7 +29,7 @@ from cablejax.control.targets import Shape, make_target, target_from_keypoints
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.networks import GNS
-from cablejax.dynamics.weights import released_names, save_weights
+from cablejax.dynamics.weights import WeightsError, released_names, save_weights
 from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.effects.physics import mean_resistance, nominal_physics
 from cablejax.mpc import MPCConfig
@@ -77,7 +77,7 @@ def test_informed_of_nothing_a_model_is_as_it_was(model):
     assert same.config == model.config and same.dynamics == model.dynamics and same.known == ()
 
 
-def test_a_conditioned_model_begins_with_its_own_cable_and_may_believe_what_it_was_trained_on(tmp_path):
+def test_a_conditioned_model_that_records_no_inputs_begins_with_its_own_cable(tmp_path):
     """The inputs are log ratios to the reference cable, which this one is not."""
     cable = Cable(length=0.6, linear_density=0.3, bending_stiffness=0.2, n_keypoints=SMALL.n_keypoints)
     config = dataclasses.replace(SMALL, conditioned=True, length=0.6)
@@ -92,6 +92,30 @@ def test_a_conditioned_model_begins_with_its_own_cable_and_may_believe_what_it_w
     np.testing.assert_allclose(softer.believed, own + np.log([0.5, 1.0]), atol=1e-6)
     adaptation = make_controller(model, make_target("U", cable), method="direct", solver="two-trials").config.adaptation
     np.testing.assert_allclose(np.array(adaptation.limits), own[:, None] + [-2.4, 1.2])
+
+
+def test_a_conditioned_model_begins_with_what_it_was_trained_on_and_believes_no_more(tmp_path):
+    cable, config = Cable(n_keypoints=SMALL.n_keypoints), dataclasses.replace(SMALL, conditioned=True, prior="static")
+    weights = nnx.split(GNS(config, nnx.Rngs(0)))[1]
+
+    def saved(**inputs):
+        info = {"cable": cable_to_fields(cable), "inputs": inputs}
+        save_weights(tmp_path / "weights.safetensors", config, weights, info)
+        return load_model(str(tmp_path))
+
+    # five times as stiff, and always on the same table
+    limits = ((1.5, 1.7), (0.2, 0.2))
+    model = saved(mean=(1.6, 0.2), limits=limits)
+    assert model.believed == knowing(model, ()).believed == (1.6, 0.2)
+    mpc = make_controller(model, make_target("U", cable), method="direct", solver="two-trials")
+    assert mpc.config.adaptation.limits == limits and mpc.config.adaptation.prior_mean == (1.6, 0.2)
+    stiffer = knowing(model, (parse_effect("bending_stiffness:ratio=5.2"),))
+    np.testing.assert_allclose(stiffer.believed, [np.log(5.2), 0.2], rtol=1e-6)
+    # an effect that says nothing of either leaves both; the nominal cable is far from here
+    assert knowing(model, (parse_effect(CURVED),)).believed == (1.6, 0.2)
+    for wrong in ({"mean": (1.8, 0.2)}, {"mean": (1.6,)}, {"limits": 3}, {"mean": ("soft", 0.2)}, {"range": 1}):
+        with pytest.raises(WeightsError, match="records inputs that cannot be used"):
+            saved(**{"mean": (1.6, 0.2), "limits": limits} | wrong)
 
 
 def test_a_conditioned_model_begins_with_what_it_is_informed_of():

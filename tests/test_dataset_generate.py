@@ -17,6 +17,8 @@ import pytest
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.commands.train import Train
+from cablejax.control.cable_inputs import CableInputs
+from cablejax.control.shaping import load_model
 from cablejax.dataset import generate as generation
 from cablejax.dataset.drawing import draw
 from cablejax.dataset.generate import (
@@ -73,10 +75,11 @@ def test_what_is_known_of_a_cable_has_its_effects(tmp_path):
     ],
 )
 def test_a_training_flips_what_is_as_likely_and_is_of_the_cable_alone(tmp_path, text, asymmetric, outside):
-    config = dataclasses.replace(STAGED, effects=(parse_effect(text),), interval=0.5)
+    varied = Randomisation(stiffness=(0.5, 2.0))
+    config = dataclasses.replace(STAGED, effects=(parse_effect(text),), interval=0.5, randomisation=varied)
     assert (config.asymmetric, config.untrainable) == (asymmetric, outside)
     generate(config, tmp_path / "data", progress=False)
-    training = Train(data=(tmp_path / "data",), out=tmp_path / "out", preset="smoke", prior="rigid")
+    training = Train(data=(tmp_path / "data",), out=tmp_path / "out", preset="smoke", prior="rigid", conditioned=True)
     if outside:
         with pytest.raises(ValueError, match=rf"{outside[0]}\. A model is of the cable itself.*camera and of the arms"):
             training.execute()
@@ -85,6 +88,9 @@ def test_a_training_flips_what_is_as_likely_and_is_of_the_cable_alone(tmp_path, 
         assert table.partition("\n")[0].endswith(" 0.5 s"), "the only horizon, of one command"
         made = json.loads((tmp_path / "out" / "run.json").read_text())
         assert made["config"]["flips"] is not bool(asymmetric)
+        # the second trajectory is held out
+        (first, _), inputs = read_trajectories(tmp_path / "data").cable.tolist(), load_model(str(training.out)).inputs
+        assert inputs == CableInputs(tuple(first), tuple((x, x) for x in first))
 
 
 STAGED = dataclasses.replace(

@@ -29,7 +29,7 @@ class AdaptationConfig:
 
     Attributes:
         prior_mean: c_0, the log ratios of stiffness and friction to those of the reference cable before anything was
-            seen: the model's nominal cable, or what a diagnosis named.
+            seen: the mean of the model's training data, or what a diagnosis named.
         prior_std: their standard deviation: a factor of e either way.
         error_std: standard deviation of a keypoint's coordinate that no cable explains [m]. Errors of neighbouring
             keypoints are alike, so this is above the error of one.
@@ -37,7 +37,8 @@ class AdaptationConfig:
         outlier: root mean square error of one step, in units of `error_std`, beyond which it counts less and less: a
             cable that snaps through says nothing about its stiffness.
         max_step: largest change of a log ratio in one step: the model is linearised.
-        limits: smallest and largest log ratio believed, of stiffness and of friction: what the model is trained on.
+        limits: smallest and largest log ratio believed, of stiffness and of friction. `control.shaping.make_controller`
+            takes those of the model's training data; the default is that of the released models, which record none.
     """
 
     prior_mean: tuple[float, float] = (0.0, 0.0)
@@ -46,11 +47,11 @@ class AdaptationConfig:
     memory: float = 0.95
     outlier: float = 3.0
     max_step: float = 0.5
-    limits: tuple[tuple[float, float], tuple[float, float]] = ((-2.4, 1.2), (-2.4, 1.2))
+    limits: tuple[tuple[float, float], ...] = ((-2.4, 1.2), (-2.4, 1.2))
 
     def __post_init__(self):
         check(self, prior_std="positive", error_std="positive", memory="share", outlier="positive", max_step="positive")
-        if np.shape(self.limits) != (2, 2) or not all(low < high for low, high in self.limits):
+        if np.shape(self.limits) != (2, 2) or not all(low <= high for low, high in self.limits):
             raise ValueError(
                 f"AdaptationConfig.limits are {self.limits}, expected the smallest and the largest log ratio of "
                 "stiffness, and those of friction."

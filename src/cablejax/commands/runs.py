@@ -73,6 +73,7 @@ class Job:
                 "weights": fingerprint(self.model.weights),
                 "cable": dataclasses.asdict(self.model.cable),
                 "believed": self.model.believed,
+                "limits": self.model.inputs.limits,
             },
             "plant": dataclasses.asdict(self.plant),
             "camera": None if self.camera is None else dataclasses.asdict(self.camera),

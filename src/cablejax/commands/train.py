@@ -190,6 +190,7 @@ class Train(Command):
     def _info(self, config: TrainConfig, stores: list[Store], held_out: list[int]) -> dict[str, Any]:
         """Provenance of the weights, without local paths."""
         from cablejax.cable_file import cable_to_fields
+        from cablejax.control.cable_inputs import inputs_of_data
         from cablejax.dataset.schema import config_to_json
         from cablejax.report.provenance import machine, versions
 
@@ -199,6 +200,8 @@ class Train(Command):
         del training["model"]  # the weights file has it, with the normalisation
         return {
             "cable": cable_to_fields(stores[0].config.cable),
+            # what the model may believe of a cable
+            **({"inputs": dataclasses.asdict(inputs_of_data(stores, self.held_out))} if self.conditioned else {}),
             "effects": list(dict.fromkeys(effect for store in stores for effect in store.config.effects_shown)),
             "data": [
                 {

@@ -12,7 +12,8 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.adaptation.belief import AdaptationConfig
-from cablejax.cable import Cable, Discretisation
+from cablejax.cable import Cable
+from cablejax.control.cable_inputs import CableInputs, inputs_of, inputs_of_weights
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target, straight_start
@@ -21,8 +22,7 @@ from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply, structure_of
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights
 from cablejax.effects import OUTSIDE
-from cablejax.effects.given import GivenEffect, with_effects
-from cablejax.effects.physics import mean_resistance, nominal_physics
+from cablejax.effects.given import GivenEffect
 from cablejax.limits import shown
 from cablejax.mpc import MPC, SOLVERS, MPCConfig
 from cablejax.perceive.camera import CameraConfig
@@ -33,7 +33,7 @@ from cablejax.simulate.chain.statics import Statics, statics_with
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.solver_names import SolverName
-from cablejax.types import History, cable_descriptor
+from cablejax.types import History
 
 _NEAR = 0.01
 """By how much a target's ends may be closer or farther apart than the grippers may be, in lengths of the cable."""
@@ -61,6 +61,7 @@ class Model:
         effects: effects in those data, for a reader: `DatasetConfig.effects_shown`.
         known: effects that the model was informed of after its training, see `knowing`.
         believed: descriptor of the cable before anything was seen, for a conditioned model: see `cable_descriptor`.
+        inputs: mean and limits of that descriptor in the data that a conditioned model was trained on.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Model:
     effects: tuple[str, ...] = ()
     known: tuple[str, ...] = ()
     believed: tuple[float, float] = (0.0, 0.0)
+    inputs: CableInputs = dataclasses.field(default_factory=CableInputs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,8 +112,9 @@ def load_model(name: str) -> Model:
     if not isinstance(effects, list) or not all(isinstance(effect, str) for effect in effects):
         raise ValueError(f"{name} records the effects {shown(effects)}, expected a list of texts.")
     cable = cable_of_weights(name)
-    believed = _believed((), cable) if config.conditioned else (0.0, 0.0)
-    return Model(name, config, NetworkDynamics(graphdef), weights, cable, tuple(effects), believed=believed)
+    inputs = inputs_of_weights(name, cable) if config.conditioned else CableInputs()
+    dynamics = NetworkDynamics(graphdef)
+    return Model(name, config, dynamics, weights, cable, tuple(effects), believed=inputs.mean, inputs=inputs)
 
 
 def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
@@ -119,8 +122,8 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
 
     Its static prior rests as a cable with them does (`stiffness_profile`, `intrinsic_curvature`,
     `gripper_rotation_offset`, `gripper_compliance`); a conditioned model begins with the ratios of stiffness and
-    friction that they make (`bending_stiffness`, `table_friction`, `linear_density`). What else they do is left to the
-    network and to what is learned online.
+    friction that they make (`bending_stiffness`, `table_friction`, `linear_density`), within those of its training
+    data. What else they do is left to the network and to what is learned online.
 
     Raises:
         ValueError: nothing of the effects enters the model; names the ways that remain.
@@ -134,56 +137,26 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
             "nor stiffness and friction of a conditioned model, such as gns-conditioned. Simulate data with it "
             "(`cablejax simulate --with`) and train on them (`cablejax train --start-from`)."
         )
-    statics, believed = _informed(model, effects)
-    config = dataclasses.replace(model.config, statics=statics)
+    config = dataclasses.replace(model.config, statics=_statics(model, effects))
     return dataclasses.replace(
         model,
         config=config,
         dynamics=NetworkDynamics(structure_of(config)[0]),
         known=tuple(map(str, effects)),
-        believed=believed,
+        believed=model.inputs.with_effects(effects, model.cable) if config.conditioned else model.believed,
     )
 
 
 def enters(model: Model, effects: Sequence[GivenEffect]) -> bool:
     """Whether anything of these effects enters the model, see `knowing`."""
-    statics, believed = _informed(model, effects)
-    changed = model.config.conditioned and not np.allclose(believed, _believed((), model.cable), atol=1e-6)
-    return bool(effects) and (statics != Statics() or changed)
+    nominal, changed = (inputs_of(given, model.cable) for given in ((), effects))
+    conditioned = model.config.conditioned and not np.allclose(changed, nominal, atol=1e-6)
+    return bool(effects) and (conditioned or _statics(model, effects) != Statics())
 
 
-def _informed(model: Model, effects: Sequence[GivenEffect]) -> tuple[Statics, tuple[float, float]]:
-    """Statics and belief of a model that is informed of effects."""
-    statics = statics_with(effects, model.cable) if model.config.prior == "static" else Statics()
-    return statics, _believed(effects, model.cable) if model.config.conditioned else model.believed
-
-
-def _believed(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, float]:
-    """The descriptor of a cable with effects, see `cable_descriptor`, within what conditioned models are trained on.
-
-    In slow motion only the ratio of stiffness and friction matters: what is beyond a bound of one is taken up by the
-    other.
-    """
-    stiffness, friction = _descriptor(effects, cable)
-    softest_to_stiffest, smoothest_to_roughest = _believable(cable)
-    within = np.clip(friction, *smoothest_to_roughest)
-    return float(np.clip(stiffness - (friction - within), *softest_to_stiffest)), float(within)
-
-
-def _believable(cable: Cable) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits of both inputs of a conditioned model, about those of its nominal cable."""
-    about = _descriptor((), cable)
-    stiffness, friction = (
-        (own + low, own + high) for own, (low, high) in zip(about, AdaptationConfig().limits, strict=True)
-    )
-    return stiffness, friction
-
-
-def _descriptor(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, float]:
-    config = Discretisation(cable)
-    physics = with_effects(nominal_physics(config, np.float64), effects, config)
-    stiffness, friction = cable_descriptor(*map(np.asarray, mean_resistance(physics)))
-    return float(stiffness), float(friction)
+def _statics(model: Model, effects: Sequence[GivenEffect]) -> Statics:
+    """The resting shape of the model's cable with effects, where it has a prior that rests."""
+    return statics_with(effects, model.cable) if model.config.prior == "static" else Statics()
 
 
 def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> MPC:
@@ -208,7 +181,7 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
         adaptation = AdaptationConfig(
             prior_mean=model.believed,
             error_std=AdaptationConfig.error_std * model.config.length,
-            limits=_believable(model.cable),
+            limits=model.inputs.limits,
         )
     config = MPCConfig.for_length(
         model.config.length,

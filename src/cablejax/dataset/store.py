@@ -148,6 +148,10 @@ class Store:
                 array[here] = getattr(block, name)[rows[here] - shard * self.config.shard_size]
         return Block(**out)
 
+    def parameters(self) -> np.ndarray:
+        """The columns of `schema.PARAMETERS` of every trajectory, not checked against its digest, shape [M, 3]."""
+        return self._load("parameters", slice(None))
+
     def digests(self) -> tuple[np.ndarray, np.ndarray]:
         """Digest of each trajectory, zero where it is not there, shape [M, 32]; and its attempts, shape [M]."""
         digest = np.zeros((self.config.n_trajectories, 32), np.uint8)

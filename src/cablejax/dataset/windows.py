@@ -38,16 +38,22 @@ def read_trajectories(
 
 def trajectory_of(config: DatasetConfig, block: Block, indices: Iterable[int]) -> Trajectory:
     """Some trajectories of a data set, by number, with the network's inputs that describe each cable."""
-    # with the effects that were simulated: a stiffer cable is known to be one
-    cables = [cable_params(config, row, int(i)) for i, row in zip(indices, block.parameters, strict=True)]
-    stiffness, friction = np.array([mean_resistance(cable) for cable in cables]).T
-    known = cable_descriptor(stiffness, friction)
     return Trajectory(
         keypoints=block.keypoints,  # pyright: ignore[reportArgumentType]
         gripper_pose=block.gripper_pose,  # pyright: ignore[reportArgumentType]
         gripper_twist=block.gripper_twist,  # pyright: ignore[reportArgumentType]
-        cable=np.asarray(known, np.float32),  # pyright: ignore[reportArgumentType]
+        cable=known_of_cables(config, block.parameters, indices),  # pyright: ignore[reportArgumentType]
     )
+
+
+def known_of_cables(
+    config: DatasetConfig, parameters: Float[np.ndarray, "M 3"], indices: Iterable[int]
+) -> Float[np.ndarray, "M 2"]:
+    """The network's inputs that describe each cable, of the rows of `parameters` of these trajectories."""
+    # with the effects that were simulated: a stiffer cable is known to be one
+    cables = [cable_params(config, row, int(i)) for i, row in zip(indices, parameters, strict=True)]
+    stiffness, friction = np.array([mean_resistance(cable) for cable in cables]).T
+    return np.asarray(cable_descriptor(stiffness, friction), np.float32)
 
 
 def concatenate(parts: Sequence[Trajectory]) -> Trajectory:

@@ -4,8 +4,8 @@ The file's metadata has one key, "cablejax", whose JSON object holds
 
     schema   "cablejax-weights/1"
     config   the `ModelConfig`, normalisation included
-    info     where the weights come from: the cable (keys of the cable file), data sets and their digests, seeds,
-             package versions, kind of machine
+    info     where the weights come from: the cable (keys of the cable file), the inputs of a conditioned network in
+             its data (`control.cable_inputs`), data sets and their digests, seeds, package versions, kind of machine
 
 and its tensors are the network's, named by their place in it: "processor.0.edge.first.1.kernel".
 """
