@@ -191,6 +191,29 @@ def test_what_does_not_enter_a_model_is_refused_with_what_to_do(model, tmp_path,
     assert "--motion uses no model" in capsys.readouterr().err
 
 
+def test_a_model_is_not_informed_of_what_it_was_trained_on(model):
+    offset, drag, stiffness = map(
+        parse_effect,
+        (
+            "gripper_rotation_offset:gripper=0,angle_rad=0.15",
+            "viscous_drag:coefficient_n_s_per_m2=2",
+            "bending_stiffness:ratio=0.5",
+        ),
+    )
+    trained = (str(offset), "viscous_drag (in 3 of 16 draws)", "bending_stiffness (in 13 of 16 draws)")
+    conditioned = load_model("gns-conditioned")
+    for one in (model, conditioned):
+        one = dataclasses.replace(one, effects=trained)
+        for effects in ((offset,), (drag,), (offset, parse_effect(CURVED))):
+            with pytest.raises(ValueError, match=f"trained on data with {effects[0].name}.*would have it twice"):
+                knowing(one, effects)
+        assert knowing(one, (parse_effect(CURVED),)).known
+    # stiffness is an input of a conditioned model: it has to be told which cable this is
+    assert knowing(dataclasses.replace(conditioned, effects=trained), (stiffness,)).believed[0] < 0
+    with pytest.raises(ValueError, match="would have it twice"):
+        knowing(dataclasses.replace(model, effects=trained), (stiffness,))
+
+
 def test_a_page_proposes_to_inform_a_model_of_what_enters_one():
     conditioned = load_model("gns-conditioned")
     assert {name for name, values in VALUES.items() if enters(conditioned, (GivenEffect(name, values),))} == INFORMING

@@ -58,7 +58,7 @@ class Model:
         dynamics: `(weights, history, twist) -> displacement`.
         weights: its arrays.
         cable: nominal cable of the data that it was trained on.
-        effects: effects in those data, for a reader: `DatasetConfig.effects_shown`.
+        effects: effects in those data, as `DatasetConfig.effects_shown` has them.
         known: effects that the model was informed of after its training, see `knowing`.
         believed: descriptor of the cable before anything was seen, for a conditioned model: see `cable_descriptor`.
         inputs: mean and limits of that descriptor in the data that a conditioned model was trained on.
@@ -126,8 +126,16 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
     data. What else they do is left to the network and to what is learned online.
 
     Raises:
-        ValueError: nothing of the effects enters the model; names the ways that remain.
+        ValueError: nothing of the effects enters the model, or it was trained on one that is none of its inputs, and
+            would have it twice; names the ways that remain.
     """
+    trained = {text.partition(":")[0].partition(" ")[0] for text in model.effects}
+    twice = [str(one) for one in effects if one.name in trained and not _input_alone(model, one)]
+    if twice:
+        raise ValueError(
+            f"The model {model.name} was trained on data with {', '.join(twice)}, and would have it twice: leave it "
+            "out (--with, --effect)."
+        )
     if effects and not enters(model, effects):
         names = ", ".join(map(str, effects))
         if all(effect.name in OUTSIDE for effect in effects):
@@ -149,9 +157,17 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
 
 def enters(model: Model, effects: Sequence[GivenEffect]) -> bool:
     """Whether anything of these effects enters the model, see `knowing`."""
+    return bool(effects) and (_changes_inputs(model, effects) or _statics(model, effects) != Statics())
+
+
+def _input_alone(model: Model, effect: GivenEffect) -> bool:
+    """Whether an effect enters a model by its inputs alone, which training data with it vary as well."""
+    return _changes_inputs(model, (effect,)) and _statics(model, (effect,)) == Statics()
+
+
+def _changes_inputs(model: Model, effects: Sequence[GivenEffect]) -> bool:
     nominal, changed = (inputs_of(given, model.cable) for given in ((), effects))
-    conditioned = model.config.conditioned and not np.allclose(changed, nominal, atol=1e-6)
-    return bool(effects) and (conditioned or _statics(model, effects) != Statics())
+    return model.config.conditioned and not np.allclose(changed, nominal, atol=1e-6)
 
 
 def _statics(model: Model, effects: Sequence[GivenEffect]) -> Statics:
