@@ -16,6 +16,7 @@ from cablejax.diagnose.motion_bounds import (
     refined,
 )
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions
+from cablejax.simulate.elastica import elastica
 
 CONFIG = Discretisation(n_links=17)
 ARCH = np.array([[0.0, 0.0, 0.4], [0.85, 0.0, -0.4]])
@@ -118,8 +119,8 @@ def test_disc_between_the_grippers_is_free_for_them_and_not_for_the_cable():
 def test_curvature_of_a_circle_and_its_bound():
     angle = np.linspace(0, 2.5, 13)
     circle = 0.2 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
-    np.testing.assert_allclose(curvature(circle), 5.0, rtol=1e-6)
-    fine = refined(circle)
+    np.testing.assert_allclose(curvature(circle, 0.2 * angle), 5.0, rtol=1e-6)
+    fine = refined(circle, 0.2 * angle)
     np.testing.assert_allclose(np.linalg.norm(fine - [0.0, 0.2], axis=1), 0.2, rtol=3e-4)
     still, points = np.repeat(ARCH[None], 5, axis=0), np.repeat(circle[None, None], 5, axis=1)
     assert cable_beyond(Bounds(bend_radius=0.19), CONFIG, still, points) == {}
@@ -172,8 +173,28 @@ def test_bounds_in_lengths_follow_the_cable():
 def test_three_keypoints_show_the_curvature_of_their_circle():
     angle = np.linspace(0.0, 1.0, 3)
     points = 0.25 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
-    np.testing.assert_allclose(curvature(points), 4.0)
-    assert refined(points).shape == (5, 2) and refined(points[:2]).shape == (3, 2)
+    np.testing.assert_allclose(curvature(points, 0.25 * angle), 4.0)
+    straight = refined(points[:2], 0.25 * angle[:2])
+    assert len(straight) == len(refined(points, 0.25 * angle)) == 41
+    np.testing.assert_allclose(straight, np.linspace(points[0], points[1], 41), atol=1e-12)
+
+
+def test_bounds_hold_for_keypoints_that_are_not_evenly_spaced():
+    pose, marks = np.array([[-0.225, 0, -1.6], [0.225, 0, 1.6]]), np.array([0, 0.02, 0.3, 0.5, 0.7, 0.98, 1.0])
+    cable, seen = (elastica(pose, 1.0, along) for along in (np.linspace(0, 1, 201), marks))
+    away, supposed = (
+        np.linalg.norm(cable[:, None] - refined(seen, along), axis=-1).min(axis=1)
+        for along in (marks, np.linspace(0, 1, 7))
+    )
+    assert away.max() < 0.015 < supposed.max()
+    poses, points = np.repeat(pose[None], 5, axis=0), np.repeat(seen[None, None], 5, axis=1)
+    # a disc on the cable where a line through evenly spaced keypoints is farthest from it
+    bounds, reach = Bounds(keep_out=((*cable[supposed.argmax()], 0.01),)), 0.01 + 0.5 * CONFIG.cable.diameter
+    stated, even = (cable_beyond(bounds, CONFIG, poses, points, arclength=along)["keep_out"] for along in (marks, None))
+    assert even < 0.5 * reach < 0.8 * reach < stated <= reach
+    # linear to an end that is as near to its neighbour
+    turns = curvature(seen, marks)
+    assert abs(turns[0] - turns[1]) < 0.2 * abs(turns[1] - turns[2])
 
 
 def test_the_smallest_distance_is_below_a_largest_one_that_is_small():

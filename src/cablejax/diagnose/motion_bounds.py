@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import CubicSpline
 
 from cablejax.arrays import wrapped
 from cablejax.cable import Discretisation
@@ -28,7 +29,7 @@ a cable to 99.5 % of its length reaches 3.6; motions that snap through reach 5 t
 STABILITY = 0.45
 """Least stability of the frictionless cable on the way, see `Equilibrium.stability`, over the number of links: 0 where
 it snaps through, 0.7 for an arch. Near 0 a small error of a clamp or a law decides where the cable goes, and when."""
-_SPACING = 5
+_SPACING, _PARTS = 5, 40
 # Of the amplification, of a motion that is planned: the real cable lies elsewhere.
 _PLANNED = 0.8
 # Grippers that moved within this time may still move a cable that friction held [samples].
@@ -193,6 +194,7 @@ def cable_beyond(
     poses: Float[np.ndarray, "T 2 3"],
     keypoints: Float[np.ndarray, "X T N 2"],
     *,
+    arclength: Float[np.ndarray, "N"] | None = None,
     margin: float = 0.0,
 ) -> dict[str, float]:
     """By how much the cable of simulated motions breaks each bound, as `grippers_beyond`.
@@ -203,13 +205,14 @@ def cable_beyond(
         poses: of the grippers at every sample.
         keypoints: true ones [m], by as many simulations as are to keep the bounds; NaN where one broke down, which
             counts as a snap-through.
+        arclength: of the keypoints [m]; None = they are evenly spaced.
         margin: kept from the workspace's edge and from discs [m]; with one, the bend radius is kept larger by a tenth,
             and the movement smaller by a fifth.
     """
     length = config.cable.length
     if not np.isfinite(keypoints).all():
         return {SNAP_THROUGH: 10.0}
-    lines = refined(keypoints)
+    along = np.linspace(0.0, length, keypoints.shape[-2]) if arclength is None else arclength
     least, most = bounds.radius(length), AMPLIFICATION
     if margin > 0:
         least, most = least * 1.1, most * _PLANNED
@@ -219,27 +222,20 @@ def cable_beyond(
     jump = float((step / np.maximum(recent, _REST * length)).max(initial=0.0))
     return _those_broken(
         {
-            **_beyond_places(bounds, lines, margin + 0.5 * config.cable.diameter, length),
-            "bend_radius": float(curvature(keypoints).max()) * least - 1,
+            **_beyond_places(bounds, refined(keypoints, along), margin + 0.5 * config.cable.diameter, length),
+            "bend_radius": float(curvature(keypoints, along).max()) * least - 1,
             SNAP_THROUGH: min(jump / most - 1, 10.0),
         }
     )
 
 
-def refined(points: Float[np.ndarray, "*B N 2"]) -> Float[np.ndarray, "*B M 2"]:
-    """A line through points of a cable with a point between each two, by cubic interpolation; straight for two."""
-    if points.shape[-2] < 3:
-        return np.stack([points[..., 0, :], points.mean(axis=-2), points[..., -1, :]], axis=-2)
-    inner = (9 * (points[..., 1:-2, :] + points[..., 2:-1, :]) - points[..., :-3, :] - points[..., 3:, :]) / 16
-    first = (3 * points[..., :1, :] + 6 * points[..., 1:2, :] - points[..., 2:3, :]) / 8
-    last = (3 * points[..., -1:, :] + 6 * points[..., -2:-1, :] - points[..., -3:-2, :]) / 8
-    between = np.concatenate([first, inner, last], axis=-2)
-    line = np.empty((*points.shape[:-2], 2 * points.shape[-2] - 1, 2))
-    line[..., ::2, :], line[..., 1::2, :] = points, between
-    return line
+def refined(points: Float[np.ndarray, "*B N 2"], arclength: Float[np.ndarray, "N"]) -> Float[np.ndarray, "*B M 2"]:
+    """A line through points of a cable at these arc lengths, and every fortieth of it between: a cubic spline."""
+    between = np.linspace(arclength[0], arclength[-1], _PARTS + 1)
+    return CubicSpline(arclength, points, axis=-2)(np.union1d(arclength, between))
 
 
-def curvature(points: Float[np.ndarray, "*B N 2"]) -> Float[np.ndarray, "*B N"]:
+def curvature(points: Float[np.ndarray, "*B N 2"], arclength: Float[np.ndarray, "N"]) -> Float[np.ndarray, "*B N"]:
     """Size of a cable's curvature at its keypoints [1/m]: of the circle through each three, linear to the ends.
 
     Two keypoints show none; three show that of their circle.
@@ -252,7 +248,9 @@ def curvature(points: Float[np.ndarray, "*B N 2"]) -> Float[np.ndarray, "*B N"]:
     sides = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1) * np.linalg.norm(a + b, axis=-1)
     inner = 2 * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]) / np.maximum(sides, 1e-12)
     beside = inner[..., [1, -2]] if inner.shape[-1] > 1 else inner[..., [0, 0]]
-    first, last = 2 * inner[..., :1] - beside[..., :1], 2 * inner[..., -1:] - beside[..., 1:]
+    gaps = np.diff(arclength)
+    first = inner[..., :1] + gaps[0] / gaps[1] * (inner[..., :1] - beside[..., :1])
+    last = inner[..., -1:] + gaps[-1] / gaps[-2] * (inner[..., -1:] - beside[..., 1:])
     return np.abs(np.concatenate([first, inner, last], axis=-1))
 
 
