@@ -28,11 +28,11 @@ if __name__ == "__main__":
             title="U, S and Z by cables of other stiffness",
             about=(
                 "The plant is C MuJoCo in space with contact and friction cones, its cable of 24 links 0.1 to 3 times "
-                "as stiff as the one trained on. Every trial starts from a straight cable whose heading, place and "
+                "as stiff as the trained one. Every trial starts from a straight cable whose heading, place and "
                 "slack depend on the seed; a cell is the mean over stiffnesses and seeds. A run ends after 60 "
-                f"commands, or after {PATIENCE} in which the error does not change. The settling time is the first "
-                "from which on the error stays within a tenth, or 1 mm, of its last value; Wang et al. do not define "
-                "theirs."
+                f"commands, or after {PATIENCE} in which the error does not change. The settling time is the time "
+                "after which the error stays near its last value: within a tenth of that value, or of the error's "
+                "total change if that is smaller, or within 1 mm. Wang et al. do not define theirs."
             ),
             small=Extent(
                 functools.partial(stiffness_cases, ("U", "S", "Z"), (2.0,)),

@@ -1,4 +1,4 @@
-"""Tables IV and V of Wang et al., RA-L 2022: U and S by two cables of another simulator family, in place of real ones.
+"""Tables IV and V of Wang et al., RA-L 2022: U and S by two cables of another simulator family, instead of real ones.
 
 python experiments/07_other_simulator.py                   # one seed, one cable, two methods: some minutes
 python experiments/07_other_simulator.py --full            # all of it; resumable, --executor shares the work
@@ -25,11 +25,11 @@ if __name__ == "__main__":
             title="U and S by cables of another simulator family",
             about=(
                 "The plants are Cosserat rods of PyElastica on a table with Stribeck friction "
-                "(`experiments/closed_loop/rod_plant.py`): no code, no friction law and no discretisation in common "
+                "(`experiments/closed_loop/rod_plant.py`). They share no code, friction law or discretisation "
                 "with the training simulator. Table IV corresponds to the paper's Ethernet cable, table V to its USB "
-                "cable. The paper's own figures, of real cables, are printed next to ours for scale. The rows of the "
-                "graph network with the static prior were run with the controller before, which took back what makes "
-                "the shape worse after eight commands instead of two."
+                "cable. The paper's own figures, of real cables, are next to ours for scale only. The rows of the "
+                "graph network with the static prior were run with an earlier controller, which waited for eight "
+                "commands instead of two before it took back motions that had worsened the shape."
             ),
             small=Extent(
                 functools.partial(real_cable_cases, ("U", "S"), tables=("IV",)),

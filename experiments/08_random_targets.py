@@ -3,7 +3,7 @@
 python experiments/08_random_targets.py                    # two of each, one method: some minutes
 python experiments/08_random_targets.py --full             # all of it; resumable, --executor shares the work
 python experiments/08_random_targets.py --full --report docs/results/random_targets.md
-python experiments/08_random_targets.py --full --seeds 2000:2050  # tasks that no choice was made on
+python experiments/08_random_targets.py --full --seeds 2000:2050  # held-out tasks
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ if __name__ == "__main__":
             title="Random targets from random starts",
             about=(
                 "Planar shaping by two arms, 13 keypoints, at most 250 commands of one second; success is a root mean "
-                "square error below 10 mm. Starts and targets are drawn as `experiments/closed_loop/protocols.py` "
-                "says, since Liang et al. give none as numbers; the cable is the MuJoCo plant's with contact and "
-                "friction cones, twice as stiff as the one trained on. The published figures are on Liang et al.'s "
-                "own tasks and simulator: for scale, not in competition."
+                "square error below 10 mm. `experiments/closed_loop/protocols.py` draws starts and targets, "
+                "since Liang et al. publish no numerical ones; the cable is the MuJoCo plant's with contact and "
+                "friction cones, twice as stiff as the trained one. The published figures are on Liang et al.'s "
+                "own tasks and simulator, for scale only."
             ),
             small=Extent(random_cases, seeds=range(2), methods=(NO_PRIOR_LEARNER,)),
             full=Extent(random_cases, seeds=range(50), methods=(DIRECT, RESIDUAL, LEARNER, NO_PRIOR_LEARNER)),

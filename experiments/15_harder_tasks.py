@@ -3,7 +3,7 @@
 python experiments/15_harder_tasks.py                    # six of each, one method: some minutes
 python experiments/15_harder_tasks.py --full             # all of it; resumable, --executor shares the work
 python experiments/15_harder_tasks.py --full --report docs/results/harder_tasks.md
-python experiments/15_harder_tasks.py --full --seeds 0:12    # tasks to choose on; those of the table are kept apart
+python experiments/15_harder_tasks.py --full --seeds 0:12    # tasks for tuning; those of the table are held out
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ if __name__ == "__main__":
             script="15_harder_tasks.py",
             title="Shapes of other cables, and disturbances",
             about=(
-                "The plant is C MuJoCo in space with contact and friction cones; commands of one second from a "
-                "straight start. Keypoints only, 90 commands: the target is the shape in which another cable, of "
-                "random stiffness, friction and bend at rest, was left by friction; the cable that is shaped is twice "
-                "as stiff as the one trained on, and the best that it could do is the nearest shape in which it rests "
-                "without friction, its grippers as far apart as the controller's bounds ask for, which the straight "
-                "drive does not keep. Disturbed, 60 commands: U, S or Z, and after 29 s something happens, or the "
-                "observation is poor all the time; the cable is half, once or twice as stiff. A run is judged by the "
-                "mean error of its last ten seconds. Tasks: `experiments/closed_loop/harder.py`."
+                "The plant is C MuJoCo in space with contact and friction cones. Every run starts from a straight "
+                "cable and gets a command each second. For keypoints only (90 commands), the target is a shape in "
+                "which friction left another cable, of random stiffness, friction and rest curvature. The shaped cable "
+                "is twice as stiff as the trained one. Its best possible result is the nearest frictionless resting "
+                "shape that respects the controller's bounds on the grippers' distance; the straight drive does not "
+                "respect them. In disturbed runs (60 commands; U, S or Z), something happens after 29 s, or the "
+                "observation is poor throughout; the cable is half, once or twice as stiff as the trained one. A run "
+                "is judged by the mean error of its last ten seconds. `experiments/closed_loop/harder.py` makes the "
+                "tasks."
             ),
             small=Extent(harder_cases, seeds=range(6), methods=(NO_PRIOR_LEARNER,)),
             full=Extent(

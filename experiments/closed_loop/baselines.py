@@ -1,4 +1,4 @@
-"""What a method has to beat: a drive to the goal that knows nothing of the cable, and the statics without a network."""
+"""Baselines: a drive to the goal without a model of the cable, and the statics without a network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells of the tables: which trials stand in one, and how their mean, spread and failures are written."""
+"""Cells of the tables: selects their trials, and formats mean, spread and failures."""
 
 from __future__ import annotations
 

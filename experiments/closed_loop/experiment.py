@@ -32,8 +32,8 @@ WORST = 10
 
 SETTLING_NOTE = (
     "The settling time of a step response is the time after which the error stays within 5 or 2 % of its total change; "
-    "the strict one, in all other tables here, is within a tenth of the terminal error, or 1 mm. The paper does not "
-    "define its settling time."
+    "the strict one, in all other tables here, uses a tenth of the terminal error, or of the total change if that is "
+    "smaller, and at least 1 mm. The paper does not define its settling time."
 )
 
 
@@ -79,11 +79,11 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None
     """Runs what is missing of an experiment and prints its page."""
     parser = argparse.ArgumentParser(description=experiment.about)
     parser.add_argument("--full", action="store_true", help="the whole table instead of the small version")
-    parser.add_argument("--out", type=pathlib.Path, help="folder for trials; a run goes on where it stopped")
-    parser.add_argument("--methods", nargs="*", choices=tuple(METHODS), help="only these")
-    parser.add_argument("--seeds", type=seed_range, metavar="FIRST:END", help="these instead of the table's own")
+    parser.add_argument("--out", type=pathlib.Path, help="folder of the trials; an interrupted run resumes")
+    parser.add_argument("--methods", nargs="*", choices=tuple(METHODS), help="run only these methods")
+    parser.add_argument("--seeds", type=seed_range, metavar="FIRST:END", help="seeds to run instead of the table's own")
     executors.add_option(parser)
-    parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
+    parser.add_argument("--report", type=pathlib.Path, help="write the page of the finished rows, and run nothing")
     options = parser.parse_args(arguments)
     extent = experiment.full if options.full else experiment.small
     seeds = options.seeds or extent.seeds
@@ -162,8 +162,8 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, made: st
                 "",
                 "### What learning online changes",
                 "",
-                f"Wins / losses in pairs, by means of the last {LATE} s; p counts them as independent, and those of "
-                "one seed share their start.",
+                f"Wins / losses in pairs, by means of the last {LATE} s; p assumes independent pairs, although pairs "
+                "of one seed share their start.",
             ]
             lines += ["", interval_tables.learning_table(mine, table, WITHOUT_LEARNING)]
         if NO_PRIOR_LEARNER in methods and len(methods) > 1:
@@ -188,9 +188,9 @@ def least_times(experiment: Experiment, shown: set[tuple[str, str, float, int]])
             seconds.setdefault(case.scenario, []).append(least_time(case.task(), config))
     means = ", ".join(f"{scenario} {np.mean(values):.1f} s" for scenario, values in sorted(seconds.items()))
     return (
-        f"Straight and at the motion bound, {100 * config.radius_max:g} cm per command (a radian counts as "
-        f"{100 * config.objective.rotation_weight:g} cm), the grippers' way from these starts to where the targets' "
-        f"ends are held takes, on average: {means}."
+        f"Straight and at the motion bound ({100 * config.radius_max:g} cm per command; a radian counts as "
+        f"{100 * config.objective.rotation_weight:g} cm), the grippers need on average {means} from these starts to "
+        "the poses that hold the targets' ends."
     )
 
 

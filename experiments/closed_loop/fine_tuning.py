@@ -1,4 +1,4 @@
-"""The paper's strongest rival: transitions recorded on the very cable that is to be shaped, and a training on them."""
+"""The paper's strongest rival: a network fine-tuned on transitions of the cable that is to be shaped."""
 
 from __future__ import annotations
 

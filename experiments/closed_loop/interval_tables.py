@@ -1,4 +1,4 @@
-"""How sure the tables are: intervals, differences in pairs, and rates of success with theirs."""
+"""Tables of intervals, paired differences, and success rates with their intervals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ways across the gap that are compared: what model each believes, and what it learns while it shapes."""
+"""The methods that are compared: the model of each, and what it learns online."""
 
 from __future__ import annotations
 

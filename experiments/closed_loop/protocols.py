@@ -1,4 +1,4 @@
-"""Where a trial starts and what it asks for: the scenarios of Wang et al., RA-L 2022, and of Liang et al., 2026.
+"""Starts and targets of the trials: the scenarios of Wang et al., RA-L 2022, and of Liang et al., 2026.
 
 Neither paper gives its starts and targets as numbers. What is chosen here:
 

@@ -1,4 +1,4 @@
-"""Statistics of a few trials: what was measured, how sure it is, and what failed.
+"""Statistics of a few trials: means, intervals and failures.
 
 A failure is a value that is not finite: an error that is NaN because the cable was lost, a settling time that is
 infinite because the run never settled. Failures stay in every count. A mean and a standard deviation are those of the
