@@ -1,4 +1,4 @@
-"""Shape a cable with a model that is wrong about it, without and with the online correction.
+"""Shapes a cable with a model that is wrong about it, without and with the online correction.
 
     python experiments/01_shape_a_cable.py --out runs/01_shape_a_cable
 

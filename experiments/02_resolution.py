@@ -1,11 +1,11 @@
-"""How finely must a cable be simulated, and by which engine? The table behind the default resolution and time step.
+"""Compares simulators, resolutions and time steps: the table behind the default resolution and time step.
 
-Four questions, one row per engine and resolution:
+Measures four quantities, one row per engine and resolution:
 
   * elastica   largest distance of a keypoint of the resting chain from the exact elastica, over three shapes [mm]
   * recorded   root mean square error per coordinate of open-loop replays of another program's recordings, as a multiple
                of their noise: worst gentle episode, worst S or Z approach (needs gap-dev next to $CABLEJAX_DATA)
-  * random     distance of the keypoints from those at 2 ms, over random motions as data sets have them, until a cable
+  * random     distance of the keypoints from those at 2 ms, over random motions like those of data sets, until a cable
                snaps through [mm]: median and 99th percentile
   * cost       processor time of one simulated second of one cable [us]
 
@@ -179,12 +179,12 @@ def main() -> None:
         [
             *markdown_table(rows),
             "",
-            f"Default: **{default.n_links} links**; data are made at **20 ms** by MJX and C MuJoCo (threaded) and at",
-            "**50 ms** by the chain. The error falls with the square of the link length; at 33 links it is within",
-            "1 mm of the exact shape, and replays stay within 1.15 times the noise. Recorded motions are slow, and",
-            f"hardly show any of these time steps. Random motions do: {RANDOM.n_trajectories} motions of",
-            f"{RANDOM.n_steps} commands, {samples} samples; of each the keypoint that is farthest from the chain",
-            "at 2 ms and equal links counts.",
+            f"By default the cable has **{default.n_links} links**; MJX and C MuJoCo (threaded) make data at",
+            "**20 ms**, the chain at **50 ms**. The error falls with the square of the link length; at 33 links it is",
+            "within 1 mm of the exact shape, and replays stay within 1.15 times the noise. Slow recorded motions",
+            f"hardly depend on the time step. Random motions do: {RANDOM.n_trajectories} motions of",
+            f"{RANDOM.n_steps} commands, {samples} samples. The error of a sample is that of its worst keypoint,",
+            "compared with the chain at 2 ms and the same number of links.",
             "",
             "## A network trained on the chain's data",
             "",

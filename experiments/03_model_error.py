@@ -1,7 +1,8 @@
-"""How far off are the learned model's predictions? The table of open-loop errors on cables that training did not see.
+"""Measures the learned model's open-loop error on held-out trajectories.
 
-The weights' file says from which data sets they were trained and how many trajectories of each were held out. Those are
-read from the stores given, or simulated again: a trajectory depends on its number and seed alone.
+The file of the weights lists the data sets that they were trained on, and how many trajectories of each were held out.
+The held-out trajectories are read from the stores given, or simulated again: a trajectory depends on its number and
+seed alone.
 
     python experiments/03_model_error.py --out docs/results/model_error.md
     python experiments/03_model_error.py --weights runs/train --data runs/random.zarr runs/straight.zarr runs/free.zarr
@@ -52,7 +53,7 @@ def main() -> None:
     parser.add_argument("--weights", default="gns-reference", help="released name, weights file or training's folder")
     parser.add_argument("--data", nargs="*", default=[], help="the stores that the weights were trained on, in order")
     parser.add_argument("--stride", type=int, default=10, help="samples between start points")
-    parser.add_argument("--limit", type=int, help="only so many held-out trajectories of each data set")
+    parser.add_argument("--limit", type=int, help="use at most this many held-out trajectories of each data set")
     parser.add_argument("--out", type=Path, help="write the page there as Markdown")
     options = parser.parse_args()
     config, graphdef, weights = load_weights(options.weights)
@@ -84,10 +85,10 @@ def main() -> None:
             f"Held-out trajectories: {sizes}; a window starts at every {options.stride}. sample. The model sees "
             f"{config.history} samples and then only the commands. The error of a shape is the root mean square "
             "distance of its keypoints from the simulated ones; the columns are its root mean square, mean, median "
-            "and percentiles over windows, and its root mean square over that of the distance that the cable moved.",
+            "and percentiles over windows, and its root mean square divided by that of the cable's movement.",
             "",
             "Predictors: the network; the static prior that it corrects, alone; the rigid interpolation of the "
-            "grippers' motion; and the expectation that nothing moves.",
+            "grippers' motion; and no motion.",
             "",
             "A window counts as a snap-through if in one of its steps, or in the two before it, some keypoint of the "
             f"true cable moves further than {SNAP_FACTOR:g} times the weighted motion of both grippers plus "

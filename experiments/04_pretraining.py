@@ -1,4 +1,4 @@
-"""Does it help to train the encoders as auto-encoders first? Both ways at a small size, on the same data and steps.
+"""Compares pretrained encoders (as auto-encoders) with end-to-end training, at a small size, on the same data.
 
 python experiments/04_pretraining.py --out docs/results/pretraining.md
 python experiments/04_pretraining.py --data runs/random.zarr
@@ -39,7 +39,7 @@ def row(name: str, error: OpenLoopError) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help=f"a data set whose first {TRAIN + HELD_OUT} trajectories are used")
-    parser.add_argument("--steps", type=int, default=1_500, help="of training, and of pretraining")
+    parser.add_argument("--steps", type=int, default=1_500, help="optimiser steps of training, and of pretraining")
     parser.add_argument("--seeds", type=int, default=2, help="repetitions")
     parser.add_argument("--out", type=Path, help="write the page there as Markdown")
     options = parser.parse_args()
@@ -73,8 +73,8 @@ def main() -> None:
         [
             f"{model.message_passing} message-passing steps of {model.latent}, {options.steps} optimiser steps of "
             f"batch {phases[0].batch} on {TRAIN} trajectories; median (95th percentile) of the open-loop error on "
-            f"{HELD_OUT} others [cm]. Pretraining: as many steps before that ({seconds:.0f} s), after which the "
-            f"auto-encoders miss {missed} (root mean square).",
+            f"{HELD_OUT} others [cm]. Pretraining takes the same number of steps first ({seconds:.0f} s); the "
+            f"auto-encoders' reconstruction error is then {missed} (root mean square).",
             "",
             *markdown_table([["", *(f"after {h}" for h in error.horizons)], *lines]),
         ],

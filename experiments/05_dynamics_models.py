@@ -1,8 +1,8 @@
-"""Which model of the cable? Open-loop error of every model over 1 to 20 steps, over 100, and on other cables.
+"""Compares models of the cable by open-loop error over 1 to 20 steps, over 100, and on other cables.
 
 The models: the released graph network; a perceptron and a recurrence along the cable, trained on the same data, with
 and without the static prior; the graph network conditioned on stiffness and friction; and the training simulator
-itself, started from the keypoints. Then what networks make of less: no prior, the world's axes instead of the
+itself, started from the keypoints. Then networks that are given less: no prior, and the world's frame instead of the
 grippers'. The rivals' weights are in experiments/weights; their cards say how they were made.
 
     python experiments/05_dynamics_models.py                   # a part of the held-out trajectories: some minutes
@@ -190,7 +190,7 @@ def draw(errors: dict[str, np.ndarray], bare: dict[str, np.ndarray], calm: np.nd
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="all held-out trajectories")
-    parser.add_argument("--out", type=Path, help="write the page there, the figure beside it")
+    parser.add_argument("--out", type=Path, help="write the page there, and its figure")
     options = parser.parse_args()
 
     parts = []
@@ -246,8 +246,8 @@ def main() -> None:
         [
             f"{len(data.gripper_twist)} held-out trajectories of the released model's data, a window every {stride} "
             "samples. All errors are root mean square keypoint distances in cm; a cell has mean, median and 90th "
-            "percentile over windows. The mean is decided by windows in which the cable snaps through or takes the "
-            "other of two shapes, see [model_error](model_error.md).",
+            "percentile over windows. Windows in which the cable snaps through, or takes the other of two shapes, "
+            "dominate the mean, see [model_error](model_error.md).",
             "",
             f"Optimiser steps: {budgets()}. The conditioned network started from the first one. Without "
             "statics all networks had the same budget; with statics the released one had twice that of its rivals.",
@@ -255,24 +255,24 @@ def main() -> None:
             "![Error over steps](../images/dynamics_models.png)",
             "",
             "The dotted line is the error that Wang et al. report for their GNN after 20 steps. The training simulator "
-            "made the data: from the keypoints alone it finds its own state again within a few steps.",
+            "made the data: started from the keypoints alone, it recovers its own state within a few steps.",
             "",
             f"After 20 steps the median of the MLP is {worse['MLP']:.1f} times the GNS's and that of the Bi-LSTM "
-            f"{worse['Bi-LSTM']:.1f} times, where all correct the statics of the cable: a recurrence along the cable "
+            f"{worse['Bi-LSTM']:.1f} times, if all correct the static prior: a recurrence along the cable "
             "is as good as messages between neighbours. Without statics the MLP's is "
             f"{worse['MLP, no statics']:.0f} times that of the GNS with statics, the Bi-LSTM's "
-            f"{worse['Bi-LSTM, no statics']:.0f} times, and the GNS's own {worse['GNS, no statics']:.0f} times. What "
-            "the prior knows, no network has to learn, and there the choice of the network matters little.",
+            f"{worse['Bi-LSTM, no statics']:.0f} times, and the GNS's own {worse['GNS, no statics']:.0f} times. With "
+            "the static prior, the choice of network matters little.",
             "",
             "## Prior and frame of the networks",
             "",
             "Median error after one step and after twenty, all windows. The perceptron of Wang et al. is ten times "
             "worse than their graph network; they do not state its inputs. In the grippers' frame a motion is the "
-            "same anywhere on the table. This helps the perceptron most, which in the world's frame has to learn "
+            "same anywhere on the table. The perceptron gains most: in the world's frame it has to learn "
             "every place and heading separately. The graph network sees neighbours relative to each other in either "
-            "frame, and hardly needs the grippers' frame for one step. The ratio still stays far below ten. None of "
-            "these networks has converged: with ten times the steps the perceptron is better than the graph network "
-            "with the usual steps.",
+            "frame, and gains little from the grippers' frame over one step. The ratio still stays far below ten. "
+            "None of these networks has converged: with ten times the steps the perceptron is better than the graph "
+            "network with the usual steps.",
             "",
             *markdown_table(medians_by_what_is_given(given, steps)),
             "",

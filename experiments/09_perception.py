@@ -1,11 +1,11 @@
-"""How well is the cable found in point clouds? Structure preserved registration compared with coherent point drift.
+"""Measures how well a cable is found in point clouds: structure preserved registration and coherent point drift.
 
 Cables move at random between two grippers, as in the training data, and are seen at 10 Hz. For every condition:
 
   * error    mean distance of the 13 keypoints to the true ones, mean over frames, and the worst frame's [mm]
-  * held     frames in which the tracker said that it did not see the cable
-  * lost     cables that were taken to be where they are not: a frame with a mean error above 10 mm without notice, or
-             no cable in the last frame
+  * held     frames in which the tracker reported that it did not see the cable
+  * lost     cables with a mean error above 10 mm in a frame that was reported as tracked, or not found in the last
+             half second
   * first    first frames found without a prior
 
 and for the loop as a whole: terminal errors of U, S and Z with clouds and with true keypoints, from the same starts
@@ -13,7 +13,7 @@ and for the loop as a whole: terminal errors of U, S and Z with clouds and with 
 
     python experiments/09_perception.py --out docs/results/perception.md --figure docs/images/perception.png [--full]
 
-Finished parts are kept in --work, so that the same command goes on where it was interrupted.
+Finished parts are kept in --work, so that the same command resumes after an interruption.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ LOOP_SEEDS, LOOP_STIFFNESS, LOOP_STEPS = range(5), 2.0, 40
 """Starts of the closed loops, as in the tables, the plant's stiffness over the trained one, and commands."""
 
 DRIFT = {"alpha": 2.0, "beta": 0.1, "sigma2": 1e-4, "w": 0.1, "max_iterations": 30, "tolerance": 1e-5}
-"""Settings of coherent point drift (lengths in m): the best of a small grid on other cables. Started from the spread of
-the whole cloud instead of 1 cm it needs five times the iterations and loses the cable more often."""
+"""Settings of coherent point drift (lengths in m): the best of a small grid on other cables. If started from the whole
+cloud's spread instead of 1 cm, CPD needs five times the iterations and loses the cable more often."""
 
 
 def moving_cable(seed: int, seconds: int) -> tuple[np.ndarray, np.ndarray]:
@@ -300,7 +300,7 @@ def main() -> None:
     parser.add_argument("--figure", type=Path, help="write the figure there")
     parser.add_argument("--work", type=Path, default=Path("runs/perception"), help="folder for finished parts")
     parser.add_argument("--full", action="store_true", help="100 cables for 60 s each, and the closed loop")
-    parser.add_argument("--seeds", type=int, help="another number of cables")
+    parser.add_argument("--seeds", type=int, help="number of cables")
     options = parser.parse_args()
     seeds, seconds = options.seeds or (100 if options.full else 3), 60 if options.full else 10
     drift_seeds, drift_seconds = (min(seeds, 10), 10) if options.full else (1, 6)
@@ -358,9 +358,9 @@ def main() -> None:
             "",
             "## In the loop",
             "",
-            f"Terminal error of the true keypoints after at most {LOOP_STEPS} commands, the network "
-            f"without statics, its estimate and the learner, the tables' plant with {LOOP_STIFFNESS:g} times the "
-            "stiffness; mean over the "
+            f"Terminal error of the true keypoints after at most {LOOP_STEPS} commands. The network has no statics; "
+            f"its estimate and the learner are on. The plant is that of the tables, with {LOOP_STIFFNESS:g} times the "
+            "stiffness. Figures are the mean over the "
             f"tables' starts of seeds {LOOP_SEEDS[0]} to {LOOP_SEEDS[-1]}, and the least and greatest difference. "
             "Clouds come from the depth camera with its default settings: 20 degrees of tilt, 2 mm of noise, 5 % "
             "dropout, 0.1 % random ranges, both grippers in view.",

@@ -1,8 +1,8 @@
-"""Are slopes in bfloat16 harmless? The same plans with exact and with rough slopes: objective, Jacobian, time.
+"""Compares plans with exact and with bfloat16 slopes: objective, Jacobian and time.
 
-The planning problems are those of experiments/11_against_ipopt.py: what the controller asked its solver for on the way
-to U, S and Z, the same with other step bounds, and random shapes. Float32, the default solver, and the same with two
-trials.
+The planning problems are those of experiments/11_against_ipopt.py: those that the controller gave its solver on the way
+to U, S and Z, the same with other step bounds, and random shapes. They are solved in float32, by the default solver and
+by the same with two trials.
 
     python experiments/13_rough_slopes.py                                  # the first 100 problems: some minutes
     python experiments/13_rough_slopes.py --out docs/results/rough_slopes.md
@@ -100,9 +100,9 @@ def main() -> None:
         [
             f"{options.n} planning problems, {model.name} with the residual fitted online, horizon 5, float32. Both "
             "kinds take turns, so that other load on the machine affects both. Exact is `jax.jacrev` of the whole "
-            "model, which also has cotangents of the grasped keypoints. The difference is that of the Jacobian, "
-            "relative to its Frobenius norm; of a plan, that of the objective at its end, relative: negative where "
-            "the plan with rough slopes is better.",
+            "model, which also has cotangents of the grasped keypoints. The Jacobian's difference is relative to its "
+            "Frobenius norm. A plan's difference is relative to the objective at its end; negative if the plan with "
+            "rough slopes is better.",
             "",
             *markdown_table(rows),
         ],

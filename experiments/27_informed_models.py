@@ -1,8 +1,8 @@
-"""What a model gains from being informed of an effect, open loop and without another training.
+"""Measures how much a model gains from being informed of an effect, open loop and without retraining.
 
     python experiments/27_informed_models.py --out docs/results/informed_models.md    # three minutes
 
-Simulates motions of a cable with each effect. A model predicts them as it was trained, and once it is informed of the
+Simulates motions of a cable with each effect. A model predicts them as it was trained, and again informed of the
 effect (`cablejax.control.shaping.knowing`, `cablejax shape --with`).
 """
 
@@ -98,8 +98,8 @@ def main() -> None:
         print(" | ".join(cells), flush=True)
     lines = [
         f"Median error after {STEPS} steps [cm], over windows of {MOTIONS} motions of {COMMANDS} s in the simulator "
-        "with the effect. *Informed* is the same network: its prior of statics rests as the cable with the effect "
-        "does, and a conditioned network is given stiffness and friction. The conditioned one's online estimate is not "
+        "with the effect. *Informed* is the same network: its static prior uses the resting shape with the effect, and "
+        "a conditioned network gets stiffness and friction as inputs. The conditioned network's online estimate is not "
         "used here.",
         "",
         *markdown_table(rows),
