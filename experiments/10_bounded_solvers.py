@@ -1,7 +1,8 @@
-"""The bounded solvers on standard ground: NIST, Hock-Schittkowski, More-Garbow-Hillstrom, Rosenbrock, an ideal rod.
+"""Compares the bounded solvers with scipy's on standard problems.
 
-Ours against scipy's `least_squares` (trf and dogbox), L-BFGS-B and SLSQP, from the same starts, with derivatives from
-JAX in float64. A solver has succeeded if its point is feasible to 1e-8 and its objective within 1e-6 of the best known.
+The problems are those of NIST, Hock and Schittkowski, More, Garbow and Hillstrom, Rosenbrock, and an ideal rod. scipy's
+solvers are `least_squares` (trf and dogbox), L-BFGS-B and SLSQP, from the same starts, with derivatives from JAX in
+float64. A solver has succeeded if its point is feasible to 1e-8 and its objective within 1e-6 of the best known.
 
     python experiments/10_bounded_solvers.py --family Rosenbrock       # one family: a minute
     python experiments/10_bounded_solvers.py --out docs/results/bounded_solvers.md    # all of them; resumable
@@ -283,14 +284,14 @@ def page(runs: list[Run], command: str) -> str:
         [
             f"{len({run.problem for run in runs})} problems in float64, derivatives by JAX, one start each. Success: "
             "feasible to 1e-8 and an objective within 1e-6 of the best known, relative to it (1e-10 where that is 0). "
-            f"Ours stop at a projected gradient of {TOLERANCE:g}; scipy's tests on gradient, objective and step are "
-            f"set to {TOLERANCE:g}, {TIGHT:g} and {TIGHT:g}, and `least_squares` scales by the Jacobian. At most "
-            f"{LEAST_SQUARES_STEPS} steps, {GRADIENT_STEPS} for methods that use gradients only. The families, their "
-            "sources and what the best known values come from are in `experiments/standard_problems/`. All solvers are "
-            "local. Some problems first had a second minimum, so that success was chance (Rosenbrock of four and "
-            "more variables, Wood, HS2, a rod that had to snap through). Their box, start or target was changed "
-            "before this table was made, after some of these solvers, ours and scipy's, had failed on them. MGH17 and "
-            "Thurber still have second minima.",
+            f"Our solvers stop at a projected gradient of {TOLERANCE:g}. scipy's tolerances on gradient, objective and "
+            f"step are {TOLERANCE:g}, {TIGHT:g} and {TIGHT:g}, and `least_squares` scales by the Jacobian. Solvers "
+            f"take at most {LEAST_SQUARES_STEPS} steps, methods that use gradients only {GRADIENT_STEPS}. The "
+            "families, their sources and the origin of the best known values are in `experiments/standard_problems/`. "
+            "All solvers are local. Some problems first had a second minimum, so success depended on chance "
+            "(Rosenbrock of four and more variables, Wood, HS2, a rod that had to snap through). Their box, start or "
+            "target was changed before this table was made, after some of these solvers, ours and scipy's, had failed "
+            "on them. MGH17 and Thurber still have second minima.",
             "",
             "## Successes",
             "",
@@ -317,8 +318,8 @@ def page(runs: list[Run], command: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--family", help="only this one")
-    parser.add_argument("--solver", choices=SOLVERS, nargs="*", default=SOLVERS, help="only these")
+    parser.add_argument("--family", help="run only this family of problems")
+    parser.add_argument("--solver", choices=SOLVERS, nargs="*", default=SOLVERS, help="run only these")
     parser.add_argument("--cache", type=Path, default=Path("runs") / "bounded_solvers.jsonl", help="finished runs")
     parser.add_argument("--out", type=Path, help="write the page there")
     options = parser.parse_args()

@@ -1,18 +1,18 @@
 """The bounded solvers against IPOPT on 1,000 planning problems, in float64, with the released network or another one.
 
-A quarter of the problems are what the controller asked its solver for on the way to U, S and Z with cables 0.5, 1 and 2
-times as stiff as the one trained on; a quarter are the same states with another step bound; half are random shapes with
-random targets. The network's corners are rounded, without which there is no stationary plan to be found. IPOPT gets the
-same objective and gradient from JAX, the same start, and on `--exact` of the problems the exact Hessian as well.
+A quarter of the problems are those that the controller gave its solver on the way to U, S and Z, with cables 0.5, 1 and
+2 times as stiff as the trained one; a quarter are the same states with another step bound; half are random shapes with
+random targets. The network's ReLUs are smoothed: without that, no plan is stationary. IPOPT gets the same objective and
+gradient from JAX, the same start, and on `--exact` of the problems the exact Hessian as well.
 
-    python experiments/11_against_ipopt.py --draw                 # once, and done: the problems, some minutes
+    python experiments/11_against_ipopt.py --draw                 # the problems, once; some minutes
     python experiments/11_against_ipopt.py --n 20                 # the first 20 of them, resumable
     python experiments/11_against_ipopt.py --n 1000 --executor 2      # in two processes, or tcp://...
     python experiments/11_against_ipopt.py --explain              # the exceptions
-    python experiments/11_against_ipopt.py --kinks 10             # why the network's corners are rounded
+    python experiments/11_against_ipopt.py --kinks 10             # why the ReLUs are smoothed
     python experiments/11_against_ipopt.py --calls 60             # a control call, and IPOPT until it is as good
     python experiments/11_against_ipopt.py --n 60 --exact 0 --weights experiments/weights/gns-rigid   # no snap-through
-    python experiments/11_against_ipopt.py --report docs/results/against_ipopt.md     # the page, of what is done
+    python experiments/11_against_ipopt.py --report docs/results/against_ipopt.md     # the page of the finished rows
 """
 
 from __future__ import annotations
@@ -173,8 +173,8 @@ def page(options: argparse.Namespace, folder: Path, n_all: int) -> str:
     machines = ", ".join(sorted({row["machine"] for row in rows}))
     lines = [
         f"{len(rows)} of {n_all} problems, in a random order, seed 0; {n_exact} of them with the exact Hessian too. "
-        f"Network {options.weights}, the corners of its ReLUs rounded, with the residual fitted online, horizon 5, "
-        f"36 unknowns, float64. Ours: `against_ipopt.accurate.{ACCURATE}`. "
+        f"Network {options.weights} with smoothed ReLUs and the residual fitted online, horizon 5, "
+        f"36 unknowns, float64. Our solver: `against_ipopt.accurate.{ACCURATE}`. "
         "IPOPT: tol 1e-9 on the objective divided by its value at the start, constr_viol_tol 1e-9, "
         f"bound_relax_factor 0, adaptive mu, limited memory of 20, at most {ITERATIONS} iterations, or exact Hessian, "
         f"at most {EXACT_ITERATIONS}. Both begin at the same feasible plan.",
@@ -186,24 +186,24 @@ def page(options: argparse.Namespace, folder: Path, n_all: int) -> str:
         f"`python experiments/11_against_ipopt.py{weights} --report {options.report}`, after {done}",
         lines,
         made_on=f"{versions()}, ipyopt {version('ipyopt')}; {machines}; {platform.machine()}, "
-        f"NPROC={'/'.join(sorted({row['threads'] for row in rows}))}. The machine had other work to do meanwhile: "
-        "seconds are long, and say something only in comparison with each other.",
+        f"NPROC={'/'.join(sorted({row['threads'] for row in rows}))}. The machine had other work to do: times "
+        "are inflated; only their ratios are meaningful.",
     )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draw", action="store_true", help="make the problems, and nothing else")
-    parser.add_argument("--n", type=int, default=20, help="judge the first so many")
-    parser.add_argument("--exact", type=int, default=10, help="the first so many with the exact Hessian too")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no other problem after this time")
+    parser.add_argument("--draw", action="store_true", help="make the problems, and stop")
+    parser.add_argument("--n", type=int, default=20, help="number of problems to judge, from the first on")
+    parser.add_argument("--exact", type=int, default=10, help="number of problems with the exact Hessian too")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no further problem after this time")
     add_option(parser)
     parser.add_argument("--weights", default=RELEASED, help="released model by name, or the folder of a training")
-    parser.add_argument("--folder", type=Path, default=FOLDER, help="has the problems")
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="folder of the problems")
     parser.add_argument("--explain", action="store_true", help="explain the exceptions")
-    parser.add_argument("--kinks", type=int, help="measure the kinks of the first so many problems that are judged")
-    parser.add_argument("--calls", type=int, help="time a control call and IPOPT on the first so many problems")
-    parser.add_argument("--report", type=Path, help="run nothing; write the page on what is done to this file")
+    parser.add_argument("--kinks", type=int, help="measure the kinks on this many judged problems")
+    parser.add_argument("--calls", type=int, help="time a control call and IPOPT on this many problems")
+    parser.add_argument("--report", type=Path, help="write the page of the finished rows, and run nothing")
     options = parser.parse_args()
     cases_path = options.folder / "cases.npz"
     if options.draw:

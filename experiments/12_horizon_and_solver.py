@@ -1,11 +1,11 @@
-"""How far to look ahead, and with which solver: closed loops over horizons and solvers, error against milliseconds.
+"""Compares planning horizons and solvers in closed loop: error against milliseconds of a control call.
 
 Every pair of a horizon (1, 2, 5, 10) and a solver brings a straight cable, twice as stiff as the trained one, to U, S
 and Z on the plant in C MuJoCo, with the online residual; everything else is the controller's default.
 
     python experiments/12_horizon_and_solver.py --shapes U --horizons 5      # a part of it: some minutes
     python experiments/12_horizon_and_solver.py                              # all of it: an hour on two idle cores
-    python experiments/12_horizon_and_solver.py --report docs/results/horizon_and_solver.md   # the page of that
+    python experiments/12_horizon_and_solver.py --report docs/results/horizon_and_solver.md   # its page
 """
 
 from __future__ import annotations
@@ -142,8 +142,8 @@ def page(trials: list[Trial], table: dict, picture: str | None, made: str) -> st
         f"{', '.join(map(str, sorted({t.seed for t in trials})))}; gns-reference with the online residual. A horizon h "
         "plans h + 1 commands. Milliseconds are those of a control call in the loop, while other work was running on "
         "this machine: compare rows, and see [speed](speed.md) for the default alone. Means of a few runs support "
-        "only rough comparisons: better solved plans do not end nearer to the target here, and short horizons end as "
-        "near as long ones.",
+        "only rough comparisons: here, more accurately solved plans do not end nearer to the target, and short "
+        "horizons end as near as long ones.",
     ]
     if picture is not None:
         lines += ["", f"![Error against milliseconds]({picture})"]
@@ -199,8 +199,8 @@ def main() -> None:
     parser.add_argument("--horizons", nargs="*", type=int, choices=HORIZONS, default=(5, 2, 1, 10))
     parser.add_argument("--solvers", nargs="*", choices=tuple(PLANNERS), default=tuple(PLANNERS))
     parser.add_argument("--seeds", nargs="*", type=int, default=SEEDS)
-    parser.add_argument("--cache", type=Path, default=CACHE, help="finished runs; a run goes on where it stopped")
-    parser.add_argument("--report", type=Path, help="run nothing; write the page on what is done to this file")
+    parser.add_argument("--cache", type=Path, default=CACHE, help="file of the finished runs")
+    parser.add_argument("--report", type=Path, help="write the page of the finished rows, and run nothing")
     options = parser.parse_args()
     if options.report is None:
         wanted = [

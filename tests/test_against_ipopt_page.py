@@ -48,14 +48,14 @@ def test_shares_and_times_are_those_of_the_rows():
     starts = {"b": [{**GOOD, "kkt": 1.0}, GOOD], "c": [{**GOOD, "objective": 2.0}], "d": [GOOD]}
     explained = {name: explanation(of_row, GOOD) for name, of_row in starts.items()}
     text = "\n".join(ipopt_sections(rows, explained, [], [], ()))
-    assert "from the start that IPOPT has: 1 of 4 (25.0 %)" in text
-    assert "By up to 2 other starts, at random, until one plan has all three: **3 of 4 (75.0 %)**" in text
+    assert "from IPOPT's start: 1 of 4 (25.0 %)" in text
+    assert "With up to 2 other random starts, until one plan has all three: **3 of 4 (75.0 %)**" in text
     assert "by the objective alone 4 of 4" in text
     assert "ours within 1e-6 of IPOPT's, or better | 3 of 4 (75.0 %)" in text
     assert "limited memory, equal ends: 2 problems | 2 / 2 / 2 | 6 / 6 / 6 | 3.0 | 3.0" in text
     assert "A control call" not in text and "Slope of the objective along" not in text
     del explained["c"]
-    assert "other starts, at random" not in "\n".join(ipopt_sections(rows, explained, [], [], ()))
+    assert "other random starts" not in "\n".join(ipopt_sections(rows, explained, [], [], ()))
 
 
 @pytest.mark.parametrize(

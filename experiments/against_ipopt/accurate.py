@@ -1,4 +1,4 @@
-"""A planner that goes on until convergence: the reference plan that is compared with IPOPT's."""
+"""A planner that iterates to convergence: the reference plan that is compared with IPOPT's."""
 
 from __future__ import annotations
 

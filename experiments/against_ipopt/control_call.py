@@ -1,8 +1,8 @@
-"""What a control call's solver reaches, and how long IPOPT takes to come as far.
+"""Times IPOPT until its plan is as good as that of a control call's solver.
 
-A control call does not go on until nothing is left: it makes one linearisation and a few trial plans. Here that solve,
-compiled and in the controller's single precision, is compared with IPOPT from the same start. IPOPT gets the same
-compiled objective and gradient, and has come as far with its first feasible plan that is as good.
+A control call does not iterate to convergence: it makes one linearisation and a few trial plans. This solve, compiled
+and in the controller's single precision, is compared with IPOPT from the same start. IPOPT gets the same compiled
+objective and gradient, and is timed until its first feasible plan that is as good.
 """
 
 from __future__ import annotations

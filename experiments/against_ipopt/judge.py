@@ -1,8 +1,7 @@
-"""One planning problem by our solver and by IPOPT: objectives, feasibility, optimality, and the clock.
+"""Solves a planning problem by our solver and by IPOPT, and compares objective, feasibility, optimality and time.
 
-The problems are those of the network with rounded corners (`against_ipopt.rounded`): by the network as it was
-trained the gradient jumps, and there is no stationary point to be found. The values of the plans by that
-network are reported too.
+The problems are those of the network with rounded corners (`against_ipopt.rounded`): with the network as trained, the
+gradient jumps and no point is stationary. The objectives of the plans with the trained network are reported too.
 
 Two KKT residuals are given. The absolute one is that of `certify`, in metres as the objective's gradient is: 1e-5 means
 that moving a gripper by 1 mm promises no more than 1e-8 m^2. The scaled one is what IPOPT calls the dual infeasibility,

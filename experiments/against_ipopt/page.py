@@ -41,12 +41,12 @@ def ipopt_sections(
     Args:
         rows: of the problems.
         explained: by name.
-        kinks: rows on what corners do to the slope; none leaves the table out.
+        kinks: rows on the slope with and without smoothed ReLUs; none leaves the table out.
         calls: rows of `control_call.race`; none leaves the section out.
         solvers: whose calls these are, by name.
     """
     sections = [
-        ("Why the corners are rounded", _why_rounded(rows, kinks)),
+        ("Why the ReLUs are smoothed", _why_rounded(rows, kinks)),
         ("What the KKT residual is", _residuals(rows)),
         ("Objective and feasibility", _objectives(rows, explained)),
         ("Time to an equal objective", _seconds(rows)),
@@ -73,10 +73,10 @@ def quantiles(values: Sequence[float] | np.ndarray, digits: str = ".2g") -> str:
 def _why_rounded(rows: list[dict], kinks: list[dict]) -> list[str]:
     changes = [abs(r["sharp_objective"] - r["objective"]) / r["objective"] for r in rows]
     lines = [
-        "By the network as it was trained the objective has a kink wherever one of the million ReLUs of a rollout "
+        "With the network as trained, the objective has a kink wherever one of the million ReLUs of a rollout "
         "passes zero. Minima lie on kinks, where no gradient vanishes: a solver cannot end there with a small KKT "
-        f"residual. Rounded within {CORNER:g} of zero (`against_ipopt.rounded`), the objective of the network is "
-        "twice differentiable; at our plans its value differs from the trained network's by "
+        f"residual. With ReLUs smoothed within {CORNER:g} of zero (`against_ipopt.rounded`), the objective is twice "
+        "differentiable; at our plans its value differs from the trained network's by "
         f"{quantiles(changes)}, relative (median / 95 % / largest).",
     ]
     if not kinks:
@@ -87,7 +87,7 @@ def _why_rounded(rows: list[dict], kinks: list[dict]) -> list[str]:
         "kkt": "absolute KKT residual at the end [m]",
     }
     kinds = ("sharp", "smooth")
-    table = [["", "as trained", "rounded"]]
+    table = [["", "as trained", "smoothed"]]
     table += [
         [label, *(quantiles([row[kind][key] for row in kinks]) for kind in kinds)] for key, label in labels.items()
     ]
@@ -114,8 +114,9 @@ def _residuals(rows: list[dict]) -> list[str]:
         "is the worst element of `gradient + multipliers x normals`, of the excess over a bound and of multiplier x "
         "slack: below 1e-5 m, moving a gripper by 1 mm promises no more than 1e-8 m^2. IPOPT's `tol` asks the same of "
         "the objective divided by its value at the start (and by more where the gradient would be above 100): that is "
-        "the scaled residual, in 1/m. Where the start is near the target the absolute one is easy to meet and the "
-        "scaled one is not; the third row is relative to the largest element of the gradient at the start.",
+        "the scaled residual, in 1/m. If the start is near the target, a bound on the absolute residual is easy to "
+        "meet and one on the scaled residual is not; the third row is relative to the largest element of the gradient "
+        "at the start.",
         "",
         *markdown_table(
             [
@@ -172,7 +173,7 @@ def _all_at_once(rows: list[dict], explained: dict[str, dict]) -> list[str]:
     """On how many problems one plan has all that is asked, from the first start and from several."""
     lines = [
         "All three at once (within 1e-6 of every IPOPT's or better, feasible to 1e-8 m, KKT residual below 1e-5 m), "
-        f"from the start that IPOPT has: {share([meets_all(r, r) for r in rows])}."
+        f"from IPOPT's start: {share([meets_all(r, r) for r in rows])}."
     ]
     others = {row["name"]: explained.get(row["name"], {"starts": []})["starts"] for row in rows}
     if all(others[row["name"]] for row in rows if not meets_all(row, row)):
@@ -182,7 +183,7 @@ def _all_at_once(rows: list[dict], explained: dict[str, dict]) -> list[str]:
         )
         lines += [
             "",
-            f"By up to {max(map(len, others.values()))} other starts, at random, until one plan has all three: "
+            f"With up to {max(map(len, others.values()))} other random starts, until one plan has all three: "
             f"**{every}**; by the objective alone {good}.",
         ]
     return lines
@@ -213,7 +214,7 @@ def _calls(calls: list[dict], solvers: Sequence[str]) -> list[str]:
         [
             "",
             "ours [ms] median / 95 % / largest",
-            "IPOPT [ms], where it came as far",
+            "IPOPT [ms], if it got as far",
             "IPOPT never as good",
             "ratio of times, median (quarter, three quarters)",
         ]
@@ -232,10 +233,10 @@ def _calls(calls: list[dict], solvers: Sequence[str]) -> list[str]:
             ]
         )
     return [
-        f"On the first {len(calls)} problems, of the network as it was trained, in float32: the solve of a control "
-        "call, compiled as a whole, and IPOPT (limited memory) with the same compiled objective and gradient, from the "
-        "same start, until its first feasible plan that is as good to 1e-6. Problems whose start a solver does not "
-        f"improve are left out. {', '.join(sorted({row['machine'] for row in calls}))}.",
+        f"The first {len(calls)} problems with the network as trained, in float32. Ours is the solve of a control "
+        "call, compiled as a whole; IPOPT (limited memory) has the same compiled objective and gradient and the "
+        "same start, and is timed until its first feasible plan that is as good to 1e-6. Problems whose start a solver "
+        f"does not improve are left out. {', '.join(sorted({row['machine'] for row in calls}))}.",
         "",
         *markdown_table(table),
     ]

@@ -1,8 +1,8 @@
-"""A trained network with the corners of its ReLUs rounded: twice differentiable, and all but the same function.
+"""Smooths the ReLUs of a trained network: twice differentiable, and almost the same function.
 
 A rollout of the full-size network evaluates a million ReLUs. Along a plan one of them passes its corner about every
-micrometre, and the gradient of the planning objective jumps there. A controller does not notice; a solver that is to
-end at a point with zero gradient does: there is none, minima lie on the kinks. With rounded corners there is.
+micrometre, and the gradient of the planning objective jumps there. A controller does not notice. A solver that looks
+for a point with zero gradient finds none, since minima lie on the kinks; with rounded corners there is one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A bounded solver step by step: where it was, when, and how good that was.
+"""Records a bounded solver step by step: points, times and objectives.
 
 The loop over the steps is on the host, one compiled step after the other, as a solver in another language would call
 it, so that paths of different solvers can be compared by the clock. `cablejax.bounded` solves in one compiled call.

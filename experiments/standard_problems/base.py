@@ -1,4 +1,4 @@
-"""What a standard problem is: a smooth objective over a box or over balls, a start, and the best value known."""
+"""A standard problem: a smooth objective over a box or over balls, a start, and the best value known."""
 
 from __future__ import annotations
 
