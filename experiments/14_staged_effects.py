@@ -1,11 +1,11 @@
-"""Every effect of the library, staged in the contact plant and in the planar chain: the same change of the keypoints?
+"""Compares how each effect of the library changes the keypoints in the contact plant and in the planar chain.
 
     python experiments/14_staged_effects.py            # a minute or two; docs/results/staged_effects.md
     python experiments/14_staged_effects.py --only obstacle
 
 The plant is C MuJoCo in space with contacts, the chain is the simulator by which a diagnosis explains logs. They differ
 without any effect too, so each is compared with itself: the keypoints of one motion with the effect less those without.
-Of the two changes the table has the sizes (root mean square over all samples and keypoints), the plant's size over the
+The table has the sizes of both changes (root mean square over all samples and keypoints), the plant's size over the
 chain's, and the cosine of the angle between them as vectors.
 """
 

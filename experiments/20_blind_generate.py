@@ -1,4 +1,4 @@
-"""Makes cable logs whose cause is withheld, and locks what is true of them.
+"""Makes cable logs whose cause is withheld, and commits to their labels by hashes.
 
 python experiments/20_blind_generate.py --plan small --out DIR --labels LABELS.jsonl --hashes SET.jsonl    # five cases
 python experiments/20_blind_generate.py --plan stored ...                      # 155 cases, resumable, half an hour
@@ -31,12 +31,12 @@ def main() -> None:
     parser.add_argument("--plan", choices=PLANS, default="small")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=pathlib.Path, required=True, help="folder of the logs")
-    parser.add_argument("--labels", type=pathlib.Path, required=True, help="file of the labels, not to be shown")
+    parser.add_argument("--labels", type=pathlib.Path, required=True, help="file of the labels, which stays secret")
     parser.add_argument("--hashes", type=pathlib.Path, required=True, help="file of the set, which gets the hashes")
     parser.add_argument("--family", default="ABCD", help="letters of the families to make now")
     add_option(parser)
-    parser.add_argument("--limit", type=int, help="stop after so many cases")
-    parser.add_argument("--open-labels", action="store_true", help="also write labels.json beside the logs: not blind")
+    parser.add_argument("--limit", type=int, help="stop after this many cases")
+    parser.add_argument("--open-labels", action="store_true", help="also write labels.json next to the logs: not blind")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     cases = [case for case in PLANS[options.plan](options.seed) if case.family in options.family]

@@ -1,9 +1,9 @@
-"""Diagnoses blind cases: one row per log, without a look at any label.
+"""Diagnoses blind cases, one row per log, without reading any label.
 
 python experiments/21_blind_diagnose.py LOG_DIR --out VERDICTS.jsonl                  # resumable
 python experiments/21_blind_diagnose.py LOG_DIR --out VERDICTS.jsonl --executor 2     # in two processes, or tcp://...
 
-Uses nothing but `cablejax.diagnose.diagnose` as a user would call it on each log alone, without commissioning logs
+Calls only `cablejax.diagnose.diagnose`, as a user would, on each log alone, without commissioning logs
 unless a folder of them is given; the verdict is then called `verdict_commissioned`. A log that is refused gets a row
 with the message and no verdict. The labels' hashes are published before this runs.
 """

@@ -1,4 +1,4 @@
-"""Scores diagnoses of blind cases against the labels that were locked before.
+"""Scores diagnoses of blind cases against the labels whose hashes were published before.
 
 python experiments/22_blind_score.py SET.jsonl LABELS.jsonl VERDICTS.jsonl --keep SET.jsonl    # once, makes one file
 python experiments/22_blind_score.py SET.jsonl --report page.md
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("cases", type=pathlib.Path, nargs="+", help="files that together have hashes, labels, verdicts")
     parser.add_argument("--keep", type=pathlib.Path, help="only put the files together, checked, as this one")
     parser.add_argument("--verdict", default="verdict", help="field with the verdicts; verdict_commissioned is another")
-    parser.add_argument("--report", type=pathlib.Path, help="page to write, with figures beside it")
+    parser.add_argument("--report", type=pathlib.Path, help="page to write, with figures next to it")
     parser.add_argument(
         "--replayed", type=pathlib.Path, help="only print how these verdicts differ from the stored ones"
     )

@@ -1,12 +1,13 @@
-"""What a diagnosis is worth: name the cause, tell the model, shape the cable again.
+"""Measures what a diagnosis is worth: informs the model of the named cause, and shapes the cable again.
 
     python experiments/23_worth.py --out runs/worth     # with a learner first, seed by seed; resumable
     python experiments/23_worth.py --out runs/worth --report docs/results/worth.md
 
-The plant is MuJoCo in space with contact, and an effect that the model does not know. A target is what the plant's
-cable makes of a letter, as if a person had shown it. Six runs without a learner, 180 s in all, are the log. The model
-of every arm but the last is `gns-conditioned`, which estimates stiffness and friction online; the arms differ by what
-it was informed of before (`cablejax shape --with verdict.json`), and by the online learner:
+The plant is MuJoCo in space with contact, and has an effect that the model does not know. The target is the resting
+shape of the plant's cable in a letter's gripper poses, as if a person had shown it. Six runs without a learner, 180 s
+in all, are the log. The model of every arm but the last is `gns-conditioned`, which estimates stiffness and friction
+online; the arms differ by what the model was informed of (`cablejax shape --with verdict.json`), and by the online
+learner:
 
 - `plain`: nothing;
 - `diagnosed`: what the verdict on the log names, where that enters a model;
@@ -106,8 +107,8 @@ ARMS = tuple(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("runs/worth"))
-    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="so many of the table's seeds")
-    parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
+    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="number of the table's seeds to run")
+    parser.add_argument("--report", type=pathlib.Path, help="write the page of the finished rows, and run nothing")
     add_option(parser)
     options = parser.parse_args()
     if options.report is not None:
@@ -219,8 +220,8 @@ def page(out: pathlib.Path) -> str:
     trials = read_suite(out / "trials")[0]
     seeds = sorted({trial.seed for trial in trials})
     lines = [
-        "The plant has an effect that the model does not know. A target is what the plant's cable makes of a letter: "
-        "the keypoints that a person shows by hand. A verdict on "
+        "The plant has an effect that the model does not know. The target is the resting shape of the plant's cable "
+        "in a letter's gripper poses, as if shown by hand. A verdict on "
         f"six runs ({6 * COMMANDS} s, 1 mm noise, seeds {', '.join(map(str, LOG_SEEDS))}) informs the model; "
         f"*recorded* is trained on the same six runs instead. {len(seeds)} seeds.",
         "",
@@ -234,8 +235,8 @@ def page(out: pathlib.Path) -> str:
             "",
             *markdown_table([["effect", "letter", *(spec.name for spec in ARMS)], *table]),
             "",
-            "In pairs; negative = the first is nearer or sooner: mean difference, 95 % interval over seeds, runs "
-            "better / worse. The share is of the oracle's gain, where its interval excludes 0.",
+            "Paired differences; negative: the first is nearer or sooner. Mean difference, 95 % interval over seeds, "
+            "runs better / worse. The share is of the oracle's gain, if the gain's interval excludes 0.",
             "",
             *markdown_table(
                 [

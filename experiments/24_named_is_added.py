@@ -1,4 +1,4 @@
-"""Every effect staged in the contact plant, named by the diagnosis, and added to the engine that makes training data.
+"""Stages every effect in the contact plant, diagnoses it, and adds the named effects to the engine that makes data.
 
     python experiments/24_named_is_added.py --rows ROWS.jsonl    # a minute or two per effect; resumable
     python experiments/24_named_is_added.py --rows ROWS.jsonl --report PAGE.md
@@ -6,7 +6,7 @@
 For each of the 22 effects the plant executes nine motions. Six of them are the log that is diagnosed (1 mm noise); the
 other three are held out, without noise. The effects of `verdict.json` are then added to the engine that makes training
 data, as `cablejax simulate --with verdict.json --engine chain` does, and the held-out commands are replayed open loop,
-with and without them. `floor` is what the engine is off where neither has an effect: the plant is another simulator.
+with and without them. `floor` is the engine's error where neither has an effect: the plant is another simulator.
 """
 
 from __future__ import annotations
@@ -155,11 +155,11 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
     share = f"{np.median(ratios):.2f}" if ratios else "-"
     lines = [
         f"{hits} of {len(table)} staged effects are in the reported set. The gap shrinks in the engine that makes data",
-        f"by {share} times what it shrinks by in the fitting simulator (median of {len(ratios)} effects).",
+        f"by {share} times as much as in the fitting simulator (median of {len(ratios)} effects).",
         "",
         f"One log each, six motions, {1e3 * NOISE:g} mm noise, seed {SEED}. Errors are root mean squares per",
-        f"coordinate on three held-out motions without noise. The floor, {floor:.2f} mm, is what the engine is off",
-        "without any effect. Shrinkage is `1 - (after^2 - floor^2) / (before^2 - floor^2)`, not resolved where",
+        f"coordinate on three held-out motions without noise. The floor, {floor:.2f} mm, is the engine's error",
+        "without any effect. Shrinkage is `1 - (after^2 - floor^2) / (before^2 - floor^2)`, not resolved if",
         "the gap is below 1.4 times the floor.",
         "",
         *markdown_table([head, *table]),

@@ -1,4 +1,4 @@
-"""The next motion designed, against Fisher-optimal and random safe ones, on effects that look alike.
+"""Compares designed next motions with Fisher-optimal and random safe ones, on effects that look alike.
 
     python experiments/25_next_motion.py --seeds 20 --executor 2    # three to seven minutes a seed; resumable
     python experiments/25_next_motion.py --report docs/results/next_motion.md
@@ -10,7 +10,7 @@ would go on. The arms differ by that motion only:
 
 - `designed`: most information about which explanation holds, within the bounds;
 - `fisher`: the same search for most information about the parameters of the most probable explanation;
-- `random`: one of the safe motions that keep the bounds, drawn at random: nothing clever.
+- `random`: one of the safe motions that keep the bounds, drawn at random.
 
 Constants of the search were chosen on seed 0; the table has the seeds from 1 on. Densities and drags were made larger
 after those of seeds 2, 3 and 8 had made no gap, or hardly one.
@@ -235,15 +235,15 @@ def page(rows: Sequence[dict[str, Any]], machines: str) -> str:
     kept = {arm: [not broken for name, broken in moved if name == arm] for arm in arms}
     bounds = ", ".join(f"{arm} {sum(k)} of {len(k)}" for arm, k in kept.items())
     lines = [
-        f"{len(common)} seeds, {len(RANGES)} effects in turn, by "
-        + " and ".join(f"{count} of the {name}" for name, count in sorted(families.items()))
+        f"{len(common)} seeds, {len(RANGES)} effects in turn, "
+        + " and ".join(f"{count} in the {name}" for name, count in sorted(families.items()))
         + f", {1e3 * NOISE:g} mm noise; the first log has "
         f"{len(FIRST)} motions. Motions that kept all bounds when the plant executed them: {bounds}.",
         "",
         "`designed` is the motion that the package recommends, `fisher` the same search for the parameters of the most "
-        "probable explanation, `random` any safe motion. No motion is added once the answer is clear, or the package "
-        "calls what is left inseparable, as `cablejax study` ends. A uniform cable in slow motion shows only the ratio "
-        "of stiffness to density and friction: a set of stiffness and density cannot become smaller.",
+        "probable explanation, `random` any safe motion. No motion is added once the answer is clear or the remaining "
+        "explanations are inseparable, as in `cablejax study`. A uniform cable in slow motion shows only the ratio "
+        "of stiffness to density and friction: stiffness and density cannot be separated.",
         "",
         *markdown_table(table),
         "",
@@ -264,7 +264,7 @@ def page(rows: Sequence[dict[str, Any]], machines: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", type=pathlib.Path, default=ROWS, help="file of the finished rows")
-    parser.add_argument("--seeds", type=int, default=20, help="how many set-ups")
+    parser.add_argument("--seeds", type=int, default=20, help="number of set-ups")
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
     add_option(parser)
     parser.add_argument("--report", type=pathlib.Path, help="write the page of the finished rows, and run nothing")

@@ -1,12 +1,12 @@
-"""Recordings of one set-up, and of two: how often the diagnosis says that they contradict one another.
+"""Counts how often the diagnosis calls recordings of one set-up, and of two, contradictory.
 
     python experiments/26_same_or_not.py --logs FOLDER --rows ROWS.jsonl    # a minute a pair; resumable
     python experiments/26_same_or_not.py --rows ROWS.jsonl --report docs/results/same_or_not.md
 
-Every log is dealt out to two recordings, its odd and its even episodes. Two of one log agree, and a contradiction is a
-false alarm. The first of one log with the second of the next one, in the order of their names, are recordings of two
-set-ups that differ by their effects; where both have none, or the same one, there is nothing to find. Logs that state
-different cables are left out, since such recordings are refused.
+Every log is divided into two recordings, its odd and its even episodes. Two recordings of one log agree, and a
+contradiction is a false alarm. The first recording of one log and the second of the next, in the order of their names,
+are of two set-ups that differ by their effects. Logs with the same effects are not paired, nor are logs that state
+different cables, since such recordings are refused.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--logs", type=pathlib.Path, help="folder of gap logs with labels.json")
     parser.add_argument("--rows", type=pathlib.Path, required=True)
-    parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
+    parser.add_argument("--report", type=pathlib.Path, help="write the page of the finished rows, and run nothing")
     add_option(parser)
     options = parser.parse_args()
     rows = Rows(options.rows, ("first", "second"))
@@ -107,13 +107,13 @@ def page(rows: Sequence[dict[str, Any]], made: str) -> str:
         table.append((title, f"{len(of)}", f"{found} of {len(judged)}", f"{len(of) - len(judged)}", seconds))
     missed = [row for row in rows if row["first"] != row["second"] and (row["chance"] or 0.0) >= UNLIKELY]
     lines = [
-        "Every labelled log of another program is dealt out to two recordings, its odd and its even episodes, which "
-        "agree. The first of each is joined with the second of the next log too, which is of another set-up. A chance "
-        f"below {UNLIKELY:g} that recordings of one set-up differ as much is a contradiction.",
+        "Every labelled log of another program is divided into its odd and even episodes, which agree. The first half "
+        "of each log is also joined with the second half of the next, from another set-up. A p-value below "
+        f"{UNLIKELY:g} counts as a contradiction.",
         "",
         *markdown_table(table),
         "",
-        "Recordings of two set-ups that were taken for one, by what the diagnosis says of them together: "
+        "Undetected pairs of set-ups, by their joint verdict: "
         + ("; ".join(f"{row['verdict']} {' + '.join(row['effects'])}".strip() for row in missed) or "none")
         + ".",
     ]

@@ -1,4 +1,4 @@
-"""What every effect costs a closed loop whose model does not know it: no diagnosis can gain more than that.
+"""Measures what each effect costs a closed loop whose model does not know it: a bound on the gain of a diagnosis.
 
     python experiments/28_cost_of_effects.py --out runs/cost    # seed by seed; resumable
     python experiments/28_cost_of_effects.py --out runs/cost --report docs/results/cost_of_effects.md
@@ -54,7 +54,7 @@ METHODS = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("runs/cost"))
-    parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
+    parser.add_argument("--report", type=pathlib.Path, help="write the page of the finished rows, and run nothing")
     add_option(parser)
     options = parser.parse_args()
     if options.report is not None:
@@ -130,10 +130,9 @@ def page(trials: Sequence[Trial], made: str) -> str:
         *(f"within {NEAR} cm, {method.name} [s]" for method in METHODS),
     )
     lines = [
-        "The plant has an effect that the model does not know. Its target is what the camera saw when the plant itself "
-        f"was led to a letter. Means of {seeds} seeds: error of the last 10 s, and the time to within {NEAR} cm, "
-        f"{STEPS} s for a run that never gets there. What an effect costs more than no effect is the most that "
-        "naming it can gain.",
+        "The plant has an effect that the model does not know. The target is the camera's view of the plant led to a "
+        f"letter. Means of {seeds} seeds: error of the last 10 s, and the time to within {NEAR} cm, "
+        f"{STEPS} s for a run that never gets there. The extra cost of an effect bounds the gain from naming it.",
         "",
         *markdown_table([head, *rows]),
     ]

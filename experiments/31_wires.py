@@ -1,8 +1,8 @@
-"""Real wires that hang between two clamps: how stiff they are, and which of them keep a permanent set.
+"""Diagnoses real wires that hang between two clamps: how stiff they are, and which of them keep a permanent set.
 
-Photographs of three wires, each hung five times, traced by others, who also published EI of each
-(qj25/adapteddlo_muj, arXiv 2310.00911). For each wire: which effects explain how it differs from a straight wire of the
-published EI, judged by held-out photographs; EI with a 90 % interval and the published one; and what EI would be for
+Reads photographs of three wires, each hung five times, traced by others, who also published EI of each
+(qj25/adapteddlo_muj, arXiv 2310.00911). Reports for each wire: the effects that explain how it differs from a straight
+wire of the published EI, judged by held-out photographs; EI with a 90 % interval and the published one; and EI for
 other places of the clamps, which the photographs do not show.
 
     CABLEJAX_DATA=... python experiments/31_wires.py --out docs/results/wires.md --figure docs/images/wires.png
@@ -122,9 +122,7 @@ def sets(results: dict[str, dict[str, Any]]) -> str:
                 parts.append(f"{label} {entry['value']:.3g} ({low:.3g} to {high:.3g}) {entry['unit']}".strip())
             lines.append(f"- {name}: `{effect['name']}`: {'; '.join(parts)}")
         for alike in result["verdict"]["equivalent"]:
-            lines.append(
-                f"- {name}: in the place of `{alike[0]}` may also be {' or '.join(f'`{o}`' for o in alike[1:])}"
-            )
+            lines.append(f"- {name}: instead of `{alike[0]}` possibly {' or '.join(f'`{o}`' for o in alike[1:])}")
     return "\n".join(lines)
 
 
@@ -171,11 +169,11 @@ def page(results: dict[str, dict[str, Any]], error: float, arguments: list[str],
 Made by `python experiments/31_wires.py {" ".join(arguments)}` in {seconds / 60:.0f} minutes. {versions()}. {machine()}.
 
 Three wires, each hung five times and traced in photographs (qj25/adapteddlo_muj, arXiv 2310.00911; 51 points, 1.5 m).
-The model is a planar elastica with weight; believed true is a straight wire of the published EI, in clamps that are
-level within 10 degrees. Effects are named by the rule of every diagnosis: the most probable explanation, if the gap in
-the held-out photographs shrinks by it with an interval that excludes zero. All gaps are of held-out photographs, root
-mean square per coordinate; only the angles of the clamps are fitted to them. An effect's probability is that among all
-explanations with it or with another effect in its place; the interval of a shrinkage is by resampling photographs.
+The model is a planar elastica with weight; the nominal wire is straight, with the published EI, in clamps level within
+10 degrees. Effects are named by the rule of every diagnosis: the most probable explanation, if it shrinks the gap in
+the held-out photographs significantly (the interval excludes zero). All gaps are of held-out photographs, root mean
+square per coordinate; only the angles of the clamps are fitted to them. An effect's probability is relative to all
+explanations with it or with another effect in its place; photographs are resampled for the interval of a shrinkage.
 
 {table(results)}
 
@@ -193,7 +191,7 @@ section with another EI and a section with a curved rest shape are distinguishab
 The error of a coordinate, {1e3 * error:.2f} mm, is how much the line from clamp to clamp differs among all photographs;
 errors of one photograph count as one error.
 
-**EI and the clamps.** EI is averaged over the explanations that fit it. It depends on where the clamps are, which the
+**EI and the clamps.** EI is averaged over the explanations that fit EI. It depends on where the clamps are, which the
 photographs do not show: this model clamps the wire at the first and last traced point, in clamps that may be some
 degrees off. EI over the published one, of a straight wire in level clamps farther outside (median photograph, in steps
 of 2 %; 1.6 is the end of the range):
@@ -201,7 +199,7 @@ of 2 %; 1.6 is the end of the range):
 {clamps(results)}
 
 So the interval holds for clamps at the traced ends. An offset of some millimetres, which the published analysis may
-have, moves EI by as much as it differs here.
+have, would explain the differences from the published EI.
 """
 
 

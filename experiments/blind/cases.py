@@ -1,4 +1,4 @@
-"""Makes one case: draws cable, motions and effects, scales the effects, simulates, and says what is true."""
+"""Makes one case: draws cable, motions and effects, scales the effects, simulates, and writes the label."""
 
 from __future__ import annotations
 

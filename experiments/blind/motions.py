@@ -1,4 +1,4 @@
-"""How the grippers move: the named motions of a log, commands at 10 Hz with holds.
+"""Motions of the grippers: the named motions of a log, commands at 10 Hz with holds.
 
 Every motion starts at rest with a gentle arch to the left of the line from gripper 0 to gripper 1; `mirror_` motions
 are reflected about that line. Distances are in lengths of the cable.

@@ -1,4 +1,4 @@
-"""From points of a cable to what a camera reports: material points, errors of the image, lag."""
+"""Observes points of a cable as a camera reports them: material points, errors of the image, lag."""
 
 from __future__ import annotations
 

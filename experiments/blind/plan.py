@@ -1,4 +1,4 @@
-"""Which cases there are: kinds, families of simulators, severities."""
+"""The plan of the cases: kinds, families of simulators, severities."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes cases and locks their labels; everything about a case is a row with its `name` in files of JSON lines.
+"""Writes cases and hashes of their labels; everything about a case is a row with its `name` in files of JSON lines.
 
 A label is published only as `hash`, the SHA-256 of a random salt and the label's JSON. `salt` and `label` stay in a
 private file until the diagnosis has run, and are published then: everybody can check that no label was changed, and

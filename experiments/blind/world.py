@@ -1,4 +1,4 @@
-"""What the cable, the table, the arms and the camera of one recorded log are really like.
+"""The true cable, table, arms and camera of one recorded log.
 
 The values without effect are those a log states; every effect, named or unknown, sets a few fields. A family of
 simulators reads the fields it has a law for and refuses the others.
