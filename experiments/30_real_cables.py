@@ -1,4 +1,4 @@
-"""Real cables, open loop: each step of the diagnosis by recording, and on upstream's eval split with published figures.
+"""Scores real cables open loop: each step of the diagnosis by recording, and upstream's eval split.
 
     python experiments/30_real_cables.py --data $CABLEJAX_DATA/deform
 
@@ -6,7 +6,7 @@ reads every cable of a folder of recordings, here DLO1.npz to DLO3.npz (public d
 2406.05931), and writes docs/results/real_cables.md with its figure. `--data` is a folder of .npz files, or of folders
 of .pkl files as upstream has them. Published figures are read from a table (`--published`): one line for each method,
 one column for each cable, in millimetres. All choices are made by leaving out recordings of the train split; the eval
-split, where there is one, is scored once, at the end. Goes on where it was interrupted.
+split, where there is one, is scored once, at the end. Resumes after an interruption.
 """
 
 from __future__ import annotations

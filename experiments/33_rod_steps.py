@@ -44,11 +44,10 @@ def main() -> None:
         "",
         f"{len(cases)} motions of 5 s at 100 Hz: 3 lengths (0.3, 1, 3 m) and 3 damping times (0, 0.03, 1 s) in each "
         f"row. Solved: every time step to {TOLERANCE:g} m, with a local error of at most {Rod.local_error:g} of an "
-        "edge. Coarse: every step solved, but 1/32 of a step was somewhere too long for that. Unsolved: a step without "
-        "a solution. Error: mean "
+        "edge. Coarse: every step solved, but even 1/32 of a step exceeded that error somewhere. Unsolved: a step "
+        "without a solution. Error: mean "
         f"distance of a marker's coordinate to the same simulation with {_FINER} steps a sample, as a share of the "
-        "cable's length, over the first second and over all five; where a cable is chaotic the latter grows "
-        "whatever the step.",
+        "cable's length, over the first second and over all five; for chaotic cables the latter grows for any step.",
         "",
     ]
     measures = ("steps a sample, median, largest", "error in 1 s, median, largest [%]", "in 5 s [%]")
@@ -71,7 +70,7 @@ def main() -> None:
         *markdown_table(rows),
         "",
         f"Unsolved in all: {lost[0]} of {len(cases)}, and {lost[1]} of the references. A batch holds the four "
-        "motions of one cable; times are its own, over four.",
+        "motions of one cable; times are per motion, the batch's divided by four.",
         "",
         "---",
         "",

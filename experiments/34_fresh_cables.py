@@ -1,13 +1,13 @@
-"""Fresh synthetic cables in space: is what they have named, and do the reported intervals hold?
+"""Diagnoses fresh synthetic cables in space: are their effects named, and do the intervals contain the true values?
 
-    python experiments/34_fresh_cables.py --cables 0:40 --executor 2   # to choose on; resumable, a minute each
-    python experiments/34_fresh_cables.py --calibrate       # what those make `spatial.estimate.UNMODELLED`
+    python experiments/34_fresh_cables.py --cables 0:40 --executor 2   # for tuning; resumable, a minute each
+    python experiments/34_fresh_cables.py --calibrate       # their `spatial.estimate.UNMODELLED`
     python experiments/34_fresh_cables.py --cables 1480:1520 --executor 2   # those of the page
     python experiments/34_fresh_cables.py --report docs/results/fresh_cables.md
 
 Every cable has each of five effects with a chance of one half. It is simulated by a rod that has more than is fitted
 (odd seeds) or by links on ball joints in MuJoCo (even seeds), seen through noise, and handed to the protocol of the
-real recordings: windows, search, fits to both halves of the recordings, estimates from either half and from all.
+real recordings: windows, search, fits to both halves of the recordings, estimates from each half and from all.
 """
 
 from __future__ import annotations
@@ -194,19 +194,19 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
     ratio = [max(row["halves"]) / min(row["halves"]) - 1 for row in rows]
     windows, lost = np.sum([row["windows"] for row in rows], axis=0)
     lines = [
-        f"{len(rows)} of the {len(HELD_OUT)} cables of seeds {HELD_OUT[0]} to {HELD_OUT[-1]} ({broken} left out, whose "
-        f"recordings could not be simulated, {len(HELD_OUT) - broken - len(rows)} not done), "
+        f"{len(rows)} of the {len(HELD_OUT)} cables of seeds {HELD_OUT[0]} to {HELD_OUT[-1]} ({broken} left out, "
+        f"because their recordings could not be simulated, {len(HELD_OUT) - broken - len(rows)} not done), "
         f"each with {RECORDINGS} recordings of {SAMPLES * SAMPLE_INTERVAL:g} s at {1 / SAMPLE_INTERVAL:g} Hz, through "
         "the protocol of the [real recordings](real_cables.md). Odd seeds are simulated by a rod with twice the edges "
         "of the fitted one, and with a rest curvature, markers off the centreline and grippers that roll, which are "
         "not tried; even seeds by links on ball joints in MuJoCo, which share no code with the fit. Each effect is "
-        "there with a chance of one half: EI/rho off the believed one by a factor of 1.3 or more, damping of 0.01 to "
-        "0.1 s, drag of 0.2 to 0.8 1/s at the grippers' speed, shared at random by both laws, EI somewhere off its "
+        "there with a chance of one half: EI/rho off the nominal value by a factor of 1.3 or more, damping of 0.01 to "
+        "0.1 s, drag of 0.2 to 0.8 1/s at the grippers' speed, split at random between both laws, EI somewhere off its "
         "mean by about 30 % or more, grips turned with a standard deviation of 0.2 rad in all recordings and 0.2 rad "
-        "more in each. Naming nothing would be right on none of the first column and all of "
-        "the second. Either law of drag counts for both. The markers' mass and places are not judged: every cable has "
-        "markers, whose mass motion hardly shows apart from the cable's own, and whose places are read off the "
-        "recording, some millimetres wrong.",
+        "more in each. Naming no effect would find none in the first column, and be right in all cases of the second. "
+        "Either law of drag counts for both. The markers' mass and places are not judged: motion hardly separates the "
+        "markers' mass from the cable's own, and their places are read off the recording with errors of some "
+        "millimetres.",
         "",
         *named_table(rows),
         "",
@@ -218,10 +218,10 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
     lines += [
         "## Intervals",
         "",
-        "Nine of ten should hold the true value. Judged are EI/rho and the drag at the grippers' speed of every cable, "
-        "and the parameters of effects that are named and there. All are wider than jackknife and priors give, by "
-        "`UNMODELLED`, which is calibrated on the other cables that are kept; how sure a name must be was chosen on "
-        "seeds 0 to 39.",
+        "Nine of ten intervals should contain the true value. The table covers EI/rho and the drag at the grippers' "
+        "speed of every cable, and the parameters of effects that are named and there. All intervals are wider than "
+        "jackknife and priors give, by `UNMODELLED`, which is calibrated on the other cables that are kept; the "
+        "threshold for naming was chosen on seeds 0 to 39.",
         "",
         *interval_table(rows),
         "",
@@ -232,7 +232,7 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
         f"EI/rho from the two halves of the recordings is within {100 * NEAR:.0f} % on {near[0]} cables, {near[1]}. "
         f"Windows lost or off by ten times the median: {lost} of {windows}. A cable takes "
         f"{np.median([row['seconds'] for row in rows]):.0f} s (median, its simulation and the estimates of the halves "
-        f"included). All effects together take the median error on unseen recordings from "
+        f"included). All effects together reduce the median error on unseen recordings from "
         "{:.1f} to {:.1f} mm.".format(*np.median([row["error_mm"] for row in rows], axis=0)),
         "",
         "## Every cable",
@@ -261,11 +261,11 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cables", default="0:4", help="seeds FIRST:LAST, without the last")
-    parser.add_argument("--calibrate", action="store_true", help="print what the cables to choose on make UNMODELLED")
+    parser.add_argument("--calibrate", action="store_true", help="print UNMODELLED as the other cables calibrate it")
     parser.add_argument("--trials", type=Path, default=TRIALS, help="one line per cable")
     parser.add_argument("--cache", type=Path, help="folder that keeps searches and fits")
     add_option(parser)
-    parser.add_argument("--report", type=Path, help="only write the page of the cables that are done")
+    parser.add_argument("--report", type=Path, help="write the page of the finished cables, and run nothing")
     options = parser.parse_args()
     rows = Rows(options.trials, ("seed",))
     if options.report:

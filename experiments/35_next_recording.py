@@ -1,18 +1,18 @@
-"""The next recording of a real cable in space, chosen by its expected information: is it better than one at random?
+"""Tests whether the next recording of a cable in space, chosen by its expected information, beats a random one.
 
     python experiments/35_next_recording.py --data $CABLEJAX_DATA/deform --executor 2     # resumable
     python experiments/35_next_recording.py --seeds 12 --executor 2                       # synthetic cables
     python experiments/35_next_recording.py --report docs/results/next_recording.md
 
-Replayed on recorded motion. A cable is known from three windows of 5 s, drawn from the train split, and everything is
-fitted to them. Twelve other windows of that split are candidates for the next recording. Before it is looked at, each
-has an expected information about the parameters, from the motion of its clamps alone: what the fit leaves open, sent
-through the simulator's derivatives, over the error of a good fit; the recording's own grip is not asked for. Then the
+Recorded motion is replayed. A cable is estimated from three windows of 5 s, drawn from the train split. Twelve other
+windows of that split are candidates for the next recording. Before a candidate is looked at, its expected information
+about the parameters is computed from the motion of its clamps alone: what the fit leaves open, sent through the
+simulator's derivatives, over the error of a good fit; the recording's own grip is not a parameter of interest. Then the
 cable is fitted with each candidate in turn, and scored on upstream's eval split. Synthetic cables, whose stiffness is
-known, go the same way.
+known, are treated alike.
 
 One candidate is chosen by the information, and one by a simple rule: the motion whose clamps move fastest. Random
-choice scores what the candidates do on average, and the best that a choice could do is the best of them.
+choice scores the candidates' mean, and the best in hindsight is the best of them.
 """
 
 from __future__ import annotations
@@ -145,13 +145,13 @@ def page(rows: Sequence[dict[str, Any]], made: str) -> str:
     real = [row for row in rows if row["cable"] != SYNTHETIC]
     known = [row | _off(row) for row in rows if row["cable"] == SYNTHETIC]
     lines = [
-        f"{len(real)} draws of {FIRST} windows of 5 s from real cables, and {len(known)} synthetic cables known from "
-        f"{FIRST} recordings of 1 s; the next is one of {CANDIDATES} others. `by information` is the one whose motion "
-        "is expected to be most informative about the parameters, before its markers are seen; `fastest` the one whose "
-        "clamps move fastest; `at random` the mean over all of them; `best` what nobody can choose beforehand. Means "
-        "over draws; of intervals, geometric ones.",
+        f"{len(real)} draws of {FIRST} windows of 5 s from real cables, and {len(known)} synthetic cables estimated "
+        f"from {FIRST} recordings of 1 s; the next recording is one of {CANDIDATES} others. `by information` is the "
+        "one whose motion is expected to be most informative about the parameters, before its markers are seen; "
+        "`fastest` the one whose clamps move fastest; `at random` the mean over all of them; `best` is the best in "
+        "hindsight. Means over draws; of intervals, geometric ones.",
         "",
-        "A next motion will be recommended for a cable in space once its information ranks candidates better than "
+        "A next motion is recommended for a cable in space only once its information ranks candidates better than "
         "chance.",
         "",
     ]

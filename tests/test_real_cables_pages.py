@@ -131,7 +131,7 @@ def test_a_page_of_any_cables(tmp_path):
     assert "| no simulator | 50.0 |" in text and "| no simulator | 3.0 (9.0) |" in text
     assert "| theirs, as published | 9.5 |" in text and "neither" not in text and "DLO" not in text
     assert "| **rod + ridge** | **3.0 (9.0)** |" in text and "1 / 0 of 7 |" in text and "7 of 57 for one" in text
-    assert "2.5 to 3.5" in text and "Of two, 1 blocks are left out" in text
+    assert "2.5 to 3.5" in text and "1 of two's blocks do not begin" in text
     without = page({"two": score(False)}, published, "errors.png", "where")
     assert "eval [mm]" not in without and "Upstream's eval" not in without
     (tmp_path / "published.csv").write_text("method,one\ntheirs,ten\n")

@@ -1,4 +1,4 @@
-"""What corrections read: the clamps' past and the simulated cable, in a frame that moves with the clamps.
+"""Features of the learned corrections: the clamps' past and the simulated cable, in a frame that moves with the clamps.
 
 Its origin is midway between the clamps, x along the horizontal chord, z up, so that nothing depends on where in the
 room the cable hangs or which way it faces. Nothing here is observed after the first two samples of a window.

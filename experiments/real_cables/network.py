@@ -1,4 +1,4 @@
-"""What a diagnosed simulator still gets wrong, learned by a graph network on the chain of markers.
+"""Corrects a diagnosed simulator with a graph network on the chain of markers.
 
 Nodes are the two clamps and the free markers as the rod has them, edges connect markers at most two apart. A node
 knows its simulated position, how it moved over the last 0.05 to 0.4 s, and its place along the cable; a clamp also its

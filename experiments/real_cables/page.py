@@ -95,9 +95,9 @@ def page(scores: Mapping[str, Any], published: Published, picture: str, made: st
         "",
         f"Mean absolute error of a coordinate over all markers in millimetres, the grasped ones counted as 0, from the "
         f"third sample of each window to its end ({lengths}): the number of Chen et al. (CoRL 2024, arXiv 2406.05931). "
-        "In a mean over windows none counts as more than ten times the median; how many windows are, and how many of "
-        "them could not be simulated to their end, is in the tables, and the plain mean in brackets where there are "
-        "any.",
+        "In a mean over windows, no window counts for more than ten times the median. The tables state how many "
+        "windows exceed this, and how many could not be simulated to their end; if there are any, the plain mean is in "
+        "brackets.",
         "",
         "## By recording",
         "",
@@ -124,7 +124,7 @@ def page(scores: Mapping[str, Any], published: Published, picture: str, made: st
     lines += [
         "One procedure with one set of constants for all cables. Ridge residual and graph network read the clamps' "
         "history of 0.4 s and the simulated markers, in a frame that moves with the clamps; regularisation, number of "
-        "products, size and rounds of training are chosen by leaving out recordings of what they are trained on. The "
+        "products, size and rounds of training are chosen by cross-validation over training recordings. The "
         "ridge on top of the graph network is fitted to markers that were corrected by networks trained on other "
         "recordings.",
         "",
@@ -208,8 +208,8 @@ def _about_stiffness() -> list[str]:
         "rho is the mass per length of the cable with its markers. EI/rho is estimated together with every other "
         "effect ([coverage](fresh_cables.md) on synthetic cables). The halves are different recordings of one cable: "
         f"if both intervals are right, the estimates differ by less than {_NINETY:g} standard errors on nine cables "
-        "of ten. An error that both halves share does not show here; the intervals of a diagnosis are wider, by the "
-        "effects of a cable beyond the fitted law."
+        "of ten. An error that both halves share does not show here; the intervals of a diagnosis are wider, by an "
+        "allowance for cables that the fitted law does not cover."
     ]
 
 
@@ -248,7 +248,8 @@ def _on_eval(scores: Mapping[str, Any], published: Published, learned: Sequence[
         "where there are any; the row with the mean does not use it. Upstream's split is easier than the split by "
         "recording, since it has windows of both splits in the same recording. The row of the spread shows how much "
         f"the choice of files matters: as many windows as eval has ({counts}) are drawn from all with replacement, as "
-        "upstream draws its files. Those of eval count with their error here, the others with that by recording.",
+        "upstream draws its files. Eval windows count with their error in this table, the others with their error in "
+        "the split by recording.",
     ]
 
 
@@ -271,8 +272,8 @@ def _step_by_step(scores: Mapping[str, Any]) -> list[str]:
 
 def _left_out(scores: Mapping[str, Any]) -> list[str]:
     sentences = [
-        f"Of {cable}, {len(score['left_out'])} blocks are left out, which do not begin with two samples of all "
-        f"markers: {', '.join(score['left_out'])}."
+        f"{len(score['left_out'])} of {cable}'s blocks do not begin with two samples of all markers and are left "
+        f"out: {', '.join(score['left_out'])}."
         for cable, score in scores.items()
         if score["left_out"]
     ]

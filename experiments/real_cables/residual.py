@@ -1,4 +1,4 @@
-"""What a diagnosed simulator still gets wrong, learned: a ridge regression on the clamps' history and the simulated
+"""Corrects a diagnosed simulator with a ridge regression on the clamps' history and the simulated
 cable.
 
 The correction of every free marker is a linear function of `features`, in a frame that moves with the clamps: the

@@ -1,4 +1,4 @@
-"""Synthetic recordings of a cable in space whose parameters are known, for checks of what is found in them.
+"""Synthetic recordings of a cable in space whose parameters are known, for checks of the estimates.
 
 Cables are drawn at random from wider ranges than the real ones span. The true cable is a rod with twice the edges of
 the one that is fitted, and with eight time steps a sample, of which the search makes one where that is fine enough, and
