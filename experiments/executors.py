@@ -1,4 +1,4 @@
-"""Where rows of results are computed: in this process, in several on this machine, or on a Dask cluster."""
+"""Executors for rows of results: this process, several on this machine, or a Dask cluster."""
 
 from __future__ import annotations
 

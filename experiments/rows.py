@@ -1,4 +1,4 @@
-"""Rows of results in a file, one JSON object per line: appended when finished, so that an interrupted run goes on.
+"""Rows of results in a file, one JSON object per line: appended when finished, so that an interrupted run resumes.
 
 A line is written by one call and flushed to the disk before the next row is computed, so that a run that was killed
 loses at most the rows that were not finished: readers ignore a torn last line, and the next writer cuts it off. Other
