@@ -92,9 +92,9 @@ class DepthCamera:
     def __init__(self, config: CameraConfig, chain: Discretisation):
         if config.min_height is None and _lowest(config, chain) >= chain.cable.diameter:
             raise ValueError(
-                f"CameraConfig.range_noise is {1e3 * config.range_noise:g} mm, in which a cable of "
-                f"{1e3 * chain.cable.diameter:g} mm does not stand out from the table: expected less than "
-                f"{1e3 * chain.cable.diameter / _CLEAR:.2g} mm, or a min_height."
+                f"A range noise of {1e3 * config.range_noise:g} mm hides a cable of {1e3 * chain.cable.diameter:g} mm "
+                f"on the table: expected less than {1e3 * chain.cable.diameter / _CLEAR:.2g} mm "
+                "(CameraConfig.range_noise, --noise-mm), or a min_height."
             )
         self.config, self.chain = config, chain
         self.position, self._rays = _pixels(config)
