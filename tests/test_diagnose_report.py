@@ -163,7 +163,7 @@ CASES = {
     "named with the arms": (
         lambda: diagnosis(effects=(CURVED, GAIN)),
         "Cause named",
-        ["a model informed of it", "cablejax shape --target Z --weights MODEL --with verdict.json"],
+        ["inform a model of the cause", "cablejax shape --target Z --weights MODEL --with verdict.json"],
     ),
     "none": (
         lambda: diagnosis("none", effects=(), ranking=(), gap=NO_GAP, next_motion=None, explained=None, caveats=()),
