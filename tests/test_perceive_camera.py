@@ -87,13 +87,13 @@ def test_impossible_cameras_are_refused(change, message):
         CameraConfig(**change)
 
 
-def test_a_cable_in_the_noise_of_the_range_is_refused():
-    thin = dataclasses.replace(CABLE, cable=dataclasses.replace(CABLE.cable, diameter=0.004))
-    with pytest.raises(ValueError, match=r"hides a cable of 4 mm on the table: expected less than 1\.6 mm"):
-        DepthCamera(CAMERA, thin)
-    solution = lying(TARGET.gripper_pose)
-    points = DepthCamera(dataclasses.replace(CAMERA, range_noise=0.001), thin).look(*solution)
-    assert len(points) > 100 and (np.abs(offsets(points)) < 0.02).mean() > 0.9
+@pytest.mark.parametrize(("diameter", "noise"), [(0.005, 0.002), (0.01, 0.004), (0.003, 0.001)])
+def test_the_table_is_not_taken_for_a_cable_in_noise(diameter, noise):
+    thin = dataclasses.replace(CABLE, cable=dataclasses.replace(CABLE.cable, diameter=diameter))
+    points = DepthCamera(dataclasses.replace(CAMERA, range_noise=noise), thin).look(*lying(TARGET.gripper_pose))
+    assert len(points) > 50 and (np.abs(offsets(points)) < 0.02).mean() > 0.95
+    with pytest.raises(ValueError, match=r"hides a cable of .* mm on the table: expected at most half of that"):
+        DepthCamera(dataclasses.replace(CAMERA, range_noise=0.6 * diameter), thin)
 
 
 def test_a_camera_that_sees_the_horizon_is_refused():

@@ -15,8 +15,9 @@ from cablejax.simulate.composite import link_lengths, node_offsets
 
 CENTRE_DEPTH = np.pi / 4
 """How far behind its visible surface the axis of a cylinder lies on average, seen from the side, in radii."""
-_CLEAR = 2.5
-"""Heights above the table that are taken for cable begin at so many standard deviations of the range at least."""
+_CLEAR, _VISIBLE = 2.5, 0.75
+"""Standard deviations of the range above the table at which heights that are taken for cable begin, and the part of the
+cable's diameter at which they begin at the latest."""
 MARGIN = 0.01
 """Width [m] around the cable's outline in which rays are cast. All others meet the table, which has a formula."""
 
@@ -35,8 +36,9 @@ class CameraConfig:
         range_noise: standard deviation of the measured range [m].
         dropout: probability that a pixel has no range.
         outliers: probability that a pixel has a range that is uniformly random in the last 5 % before the table.
-        min_height, max_height: what lies between these heights [m] is taken for cable. None: the cable's radius or 2.5
-            times the noise of the range, whichever is larger; and three radii above the cable's top.
+        min_height, max_height: what lies between these heights [m] is taken for cable. None: 2.5 times the
+            noise of the range, but at least half and at most three quarters of the cable's diameter; and three radii
+            above its top.
         min_neighbours: of the eight pixels around it, how many must be taken for cable too; stray pixels have few.
         gripper_size: box at each gripper (along the cable, across, up) [m], which hides what is behind it. Its own
             points are left out, as a robot does that knows where its arms are.
@@ -90,10 +92,10 @@ class DepthCamera:
     """
 
     def __init__(self, config: CameraConfig, chain: Discretisation):
-        if config.min_height is None and _lowest(config, chain) >= chain.cable.diameter:
+        if config.min_height is None and config.range_noise > 0.5 * chain.cable.diameter:
             raise ValueError(
                 f"A range noise of {1e3 * config.range_noise:g} mm hides a cable of {1e3 * chain.cable.diameter:g} mm "
-                f"on the table: expected less than {1e3 * chain.cable.diameter / _CLEAR:.2g} mm "
+                "on the table: expected at most half of that "
                 "(CameraConfig.range_noise, --noise-mm), or a min_height."
             )
         self.config, self.chain = config, chain
@@ -207,7 +209,8 @@ class DepthCamera:
 
 def _lowest(config: CameraConfig, chain: Discretisation) -> float:
     """Height [m] above which a point is taken for cable, where the configuration states none."""
-    return max(0.5 * chain.cable.diameter, _CLEAR * config.range_noise)
+    diameter = chain.cable.diameter
+    return max(0.5 * diameter, min(_CLEAR * config.range_noise, _VISIBLE * diameter))
 
 
 def _axes(config: CameraConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
