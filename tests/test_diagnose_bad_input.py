@@ -270,7 +270,7 @@ def test_a_length_a_little_wrong_is_found(length):
     """None of the effects is a wrong length, so none is named; with the right one there is no gap."""
     result = told(of_length(record(), length))
     assert result.verdict == "none" and f"m long, not {length:g} m as stated" in result.sentence
-    assert caveat(result, "that length is taken")
+    assert caveat(result, "so the diagnosis assumes that length")
     assert result.quantities["length_m"].value == pytest.approx(1.0, abs=2e-3)
 
 

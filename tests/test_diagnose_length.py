@@ -62,8 +62,8 @@ def test_caveat_on_keypoints_that_do_not_fit_the_length():
 @pytest.mark.slow
 def test_a_length_that_is_wrong_is_no_effect():
     found = diagnose(stated(record(), 1.01))
-    assert found.verdict == "none" and "if the cable is 1 m long, not 1.01 m as stated" in found.sentence
-    assert "explains this log better than any effect of one of the stated 1.01 m" in found.caveats[0]
+    assert found.verdict == "none" and "This assumes that the cable is 1 m long, not 1.01 m as stated" in found.sentence
+    assert "explains this log better than any effect on a cable of the stated 1.01 m" in found.caveats[0]
     assert verdict_json(found)["quantities"]["length_m"]["value"] == pytest.approx(1.0, abs=1e-3)
 
 

@@ -205,3 +205,11 @@ def test_a_log_with_a_target_in_which_nothing_was_observed(tmp_path, capsys):
     log = dataclasses.replace(log, keypoints=np.full_like(log.keypoints, np.nan))
     _, page = view(capsys, write_gap_log(tmp_path / "log.npz", log))
     assert "not seen to not seen" in page and "nan to" not in page
+
+
+def test_a_verdict_with_a_name_as_long_as_a_page_has_a_page(tmp_path, capsys):
+    content = verdict_json(diagnosis())
+    content["ranking"][1] |= {"name": "x" * 5000, "outcome": 10**400}
+    (tmp_path / "verdict.json").write_text(json.dumps(content))
+    _, page = view(capsys, tmp_path / "verdict.json")
+    assert "x" * 60 in page

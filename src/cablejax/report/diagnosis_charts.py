@@ -19,6 +19,8 @@ from cablejax.report.effect_words import explained_label
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 
 _MAX_RANKED = 8
+# Longest label of an effect [characters].
+_LABEL = 80
 _LIGHT_BLUE = "#56b4e9"
 _SPLIT = (
     ("noise", "noise of the recording", LIGHT.faint),
@@ -60,7 +62,9 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
             ax.spines[["bottom"]].set_visible(False)
             ax.set_title(title)
             ax.tick_params(length=0)
-        axes[0].set_yticks(y, [f"{effect_title(r.name)}{f', {r.outcome}' if r.outcome else ''}" for r in ranked])
+        labels = [f"{effect_title(r.name)}{f', {r.outcome}' if r.outcome else ''}" for r in ranked]
+        # of a file that anything may have written
+        axes[0].set_yticks(y, [label[:_LABEL] for label in labels])
         axes[0].tick_params(labelcolor=LIGHT.ink)
     return figure
 
