@@ -94,6 +94,13 @@ def _distance(keypoints: np.ndarray, grippers: np.ndarray) -> np.ndarray:
     return np.nan_to_num(np.linalg.norm(offset, axis=-1).min(axis=-1), nan=0.0)
 
 
+def gripper_motion(pose: Float[np.ndarray, "T Q P"], dimension: int) -> float:
+    """How far a gripper moves [m], the one that moves farthest: the diagonal of its places; 0 where none is known."""
+    place = pose[..., :dimension]
+    known = place[np.isfinite(place).all(axis=(1, 2))]
+    return float(np.linalg.norm(np.ptp(known, axis=0), axis=-1).max()) if len(known) else 0.0
+
+
 def geometry_fault(log: GapLog) -> str | None:
     """Finds impossible keypoints or gripper angles in a log; a message with advice, or None.
 
@@ -104,7 +111,7 @@ def geometry_fault(log: GapLog) -> str | None:
     length, dimension = float(log.meta["cable"]["length_m"]), log.keypoints.shape[-1]
     for episode, samples in enumerate(log.episode_length):
         points, pose = log.keypoints[episode, :samples], log.gripper_pose[episode, :samples]
-        moved = float(np.linalg.norm(np.ptp(pose[..., :dimension], axis=0), axis=-1).max())
+        moved = gripper_motion(pose, dimension)
         if moved > MOVED * length and np.isfinite(points).any() and np.array_equal(points[1:], points[:-1], True):
             return (
                 f"Field 'keypoints' is the same to the last digit in all {samples} samples of episode {episode}, but a "

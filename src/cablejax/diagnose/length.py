@@ -101,7 +101,7 @@ def _closeness(case: Case) -> np.ndarray:
     seen, nominal = (
         np.linalg.norm(np.diff(points, axis=2), axis=-1) for points in (case.recording.keypoints, case.nominal)
     )
-    marks = case.config.cable.keypoint_arclength + case.simulator.playback.believed.bias_along
+    marks = case.simulator.playback.arclength
     stretched = nominal > _STRETCHED * np.diff(marks)
     ratio = np.where(stretched, seen / np.where(stretched, nominal, 1.0), np.nan)
     return np.array([np.median(one[np.isfinite(one)]) for one in ratio if np.isfinite(one).any()])

@@ -173,8 +173,8 @@ class Judge:
             real.append(points[end] if own else points[begin])
             begin = end + own
         seen, config = np.stack(means).astype(float), self.playback.config
-        marks = config.cable.keypoint_arclength + np.asarray(self.playback.believed.bias_along, float)
-        beyond = cable_beyond(self.bounds, config, poses, np.stack(real), arclength=marks, margin=MARGIN)
+        along = self.playback.arclength
+        beyond = cable_beyond(self.bounds, config, poses, np.stack(real), arclength=along, margin=MARGIN)
         length = config.cable.length
         unsteady = np.abs(points[-2:] - points[1]).max() / (STEADY_CLAMP * length)
         for there, mean in zip(moved, seen, strict=True):

@@ -93,7 +93,7 @@ class PlanarCable(Simulator):
     def report(self, term, values) -> Report:
         """A fitted effect with the names and units of the gap log's format."""
         effect, config = cast(CableEffect, term.effect), self.playback.config
-        marks = tuple(config.cable.keypoint_arclength + self.playback.believed.bias_along)
+        marks = tuple(self.playback.arclength)
         marked = dataclasses.replace(config, cable=dataclasses.replace(config.cable, marks=marks))
         return Report(
             effect.reported(values, term.variant, config), dict(effect.location(values, term.variant, marked))

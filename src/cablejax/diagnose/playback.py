@@ -58,6 +58,11 @@ class Playback:
     rows: int = _ROWS
     settling: float = SETTLING
 
+    @property
+    def arclength(self) -> Float[np.ndarray, "N"]:
+        """Of the keypoints, from gripper 0 [m]."""
+        return self.config.cable.keypoint_arclength + np.asarray(self.believed.bias_along, float)
+
     @classmethod
     def of_motion(
         cls,

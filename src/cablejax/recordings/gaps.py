@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from cablejax.arrays import positions_at, stretches
 from cablejax.cable_length import coordinate_noise
-from cablejax.log_geometry import MOVED
+from cablejax.log_geometry import MOVED, gripper_motion
 from cablejax.poses import poses_at, without_misreadings
 from cablejax.recordings.take import Take, median_step, spacing
 
@@ -180,9 +180,7 @@ def _moves(take: Take, first: int, last: int, distance: float) -> bool:
     """Whether a gripper moves by more than a distance [m] between two samples, or no poses were measured."""
     if take.gripper_pose is None:
         return True
-    place = take.gripper_pose[first : last + 1, :, : take.keypoints.shape[2]]
-    seen = np.isfinite(place).all(axis=(1, 2))
-    return bool(seen.any() and np.linalg.norm(np.ptp(place[seen], axis=0), axis=-1).max() > distance)
+    return gripper_motion(take.gripper_pose[first : last + 1], take.keypoints.shape[2]) > distance
 
 
 def _slower(same: Bool[np.ndarray, " S"]) -> int:
