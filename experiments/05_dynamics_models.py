@@ -35,6 +35,7 @@ from cablejax.dynamics.weights import load_info
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.equilibrium import angles_of_keypoints
+from cablejax.simulate.motions import MotionConfig
 from cablejax.types import CableState, Trajectory
 from pages import markdown_table, page_of_results, publish
 from rivals import load_any, on_another_cable
@@ -141,7 +142,10 @@ def medians_by_what_is_given(found: dict[str, dict[str, np.ndarray]], steps: int
 def other_cable(length: float, n_keypoints: int, trajectories: int) -> Trajectory:
     """Random motions of a cable that no network was trained on; all lengths scaled alike."""
     cable = Discretisation(Cable(length=length, n_keypoints=n_keypoints))
-    config = DatasetConfig(n_trajectories=trajectories, n_steps=60, seed=7, discretisation=cable, shard_size=1)
+    motion = MotionConfig.for_length(length)
+    config = DatasetConfig(
+        n_trajectories=trajectories, n_steps=60, seed=7, discretisation=cable, motion=motion, shard_size=1
+    )
     return simulated(config, trajectories)
 
 

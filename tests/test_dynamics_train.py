@@ -30,7 +30,7 @@ from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.normalisation import fit_normalisation
 from cablejax.dynamics.run_folder import claim_folder
-from cablejax.dynamics.train import DivergedError, train
+from cablejax.dynamics.train import DivergedError, noisy_windows, train
 from cablejax.dynamics.train_config import PRESETS, Phase, TrainConfig
 from dynamics_cases import SMALL, TINY_TRAINING, network, resized, trajectories
 from open_loop import open_loop_error
@@ -307,6 +307,19 @@ def test_noise_walks_to_its_size_and_spares_the_held_ends():
     np.testing.assert_allclose(noise[:, -1, 1:-1].std(axis=0), 2e-3, rtol=0.1)
     np.testing.assert_allclose(noise[:, 0, 1:-1].std(axis=0), 2e-3 / 3**0.5, rtol=0.1)
     assert not noise[:, :, [0, -1]].any()
+
+
+def test_the_noise_of_a_phase_is_in_proportion_to_the_cable():
+    """A cable three times as small is learned with noise three times as small."""
+    phase, key = Phase(steps=1, batch=64, noise=2e-3), jax.random.key(4)
+    clean = noisy_windows(key, DATA, dataclasses.replace(phase, noise=0.0), SMALL, flips=False)
+
+    def added(length: float):
+        noisy = noisy_windows(key, DATA, phase, dataclasses.replace(SMALL, length=length), flips=False)
+        return np.asarray(noisy.history.keypoints - clean.history.keypoints)
+
+    np.testing.assert_allclose(added(0.3), 0.3 * added(1.0), atol=1e-6)
+    assert added(1.0).std() > 5e-4
 
 
 def test_normalisation_is_measured_and_leaves_out_the_wildest_steps():

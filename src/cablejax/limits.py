@@ -66,6 +66,7 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         "trajectories": Limit(1, 1_000_000, whole=True),
         "shard_size": Limit(1, 10_000, "trajectories", whole=True),
         "noise": Limit(0.0, 0.1, "m"),
+        "noise_share": Limit(0.0, 0.1, "of the cable's length"),
         "noise_mm": Limit(0.0, 100.0, "mm"),
         "probability": Limit(0.0, 1.0),
         "share": Limit(1e-6, 1.0),

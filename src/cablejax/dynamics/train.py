@@ -221,7 +221,7 @@ def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, 
     def update(state: TrainState, data: Trajectory):
         def one(state: TrainState, _):
             key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-            windows = noisy_windows(key, data, phase, model.history, flips=config.flips)
+            windows = noisy_windows(key, data, phase, model, flips=config.flips)
             loss, gradient = loss_and_gradient(loss_of, state.weights, windows, mesh)
             change, inner = optimiser.update(symmetrised(gradient, model), state.optimiser, state.weights)
             weights = optax.apply_updates(state.weights, change)
@@ -253,13 +253,13 @@ def chunk_metrics(config: TrainConfig, step: int, losses: dict[str, Array], out_
     return row
 
 
-def noisy_windows(key: Array, data: Trajectory, phase: Phase, history: int, *, flips: bool) -> Window:
+def noisy_windows(key: Array, data: Trajectory, phase: Phase, model: ModelConfig, *, flips: bool) -> Window:
     """The windows of one optimiser step, with noise on their histories."""
     key_window, key_noise = jax.random.split(key)
-    windows = draw_windows(key_window, data, batch=phase.batch, history=history, steps=phase.rollout, flips=flips)
+    windows = draw_windows(key_window, data, batch=phase.batch, history=model.history, steps=phase.rollout, flips=flips)
     if phase.noise == 0:
         return windows
-    noisy = jax.vmap(lambda k, h: random_walk_noise(k, h, phase.noise))
+    noisy = jax.vmap(lambda k, h: random_walk_noise(k, h, phase.noise * model.length))
     return dataclasses.replace(windows, history=noisy(jax.random.split(key_noise, phase.batch), windows.history))
 
 

@@ -18,7 +18,8 @@ class Phase:
         steps: optimiser steps.
         batch: windows per step.
         rollout: steps K that the model is rolled out and compared with the truth.
-        noise: final standard deviation of the random walk added to the history [m]; 0 = none.
+        noise: final standard deviation of the random walk added to the history, as a share of the cable's length; 0 =
+            none.
         lr_start: learning rate at the phase's beginning; it falls like half a cosine.
         lr_end: at its end.
     """
@@ -34,7 +35,7 @@ class Phase:
         check(
             self,
             "batch",
-            "noise",
+            noise="noise_share",
             steps="optimiser_steps",
             rollout="commands",
             lr_start="learning_rate",
