@@ -36,7 +36,7 @@ from energy import EnergyMeter
 
 from cablejax.commands.options import say
 from cablejax.commands.workloads import seconds_in_turns, setting
-from cablejax.report.provenance import versions
+from cablejax.provenance import versions
 
 
 @dataclasses.dataclass(frozen=True)

@@ -36,7 +36,7 @@ from cablejax.bounded import (
     least_squares,
     minimise,
 )
-from cablejax.report.provenance import machine, versions
+from cablejax.provenance import machine, versions
 from pages import markdown_table, page_of_results, publish
 from rows import Rows
 from standard_problems import BoundedProblem, all_problems

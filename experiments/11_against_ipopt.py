@@ -60,7 +60,7 @@ from against_ipopt.planning_problems import (
 from against_ipopt.referee import RefereeConfig
 from cablejax.control.shaping import Model, load_model
 from cablejax.mpc import SOLVERS
-from cablejax.report.provenance import machine, versions
+from cablejax.provenance import machine, versions
 from executors import add_option, executor_of
 from pages import page_of_results, publish
 

@@ -26,8 +26,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cablejax.cable import GRAVITY
+from cablejax.provenance import machine, versions
 from cablejax.recordings.wires import HangingWire, read_wires
-from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
 from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points
 from cablejax.spatial.hanging import Photographs, WireDiagnosis, diagnose_wire, rig_error, wire_verdict_json

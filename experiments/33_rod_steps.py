@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from cablejax.report.provenance import machine, versions
+from cablejax.provenance import machine, versions
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.simulate.rod.constrained import TOLERANCE
 from pages import markdown_table, publish

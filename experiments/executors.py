@@ -12,7 +12,8 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
-from cablejax.dataset.opening import package_versions
+from cablejax.dataset.opening import PACKAGES
+from cablejax.provenance import package_versions
 
 SECONDS = 20.0
 """How long a scheduler may take to answer, and how often a cluster is asked for its workers."""
@@ -91,9 +92,10 @@ def _dask(address: str) -> Iterator[concurrent.futures.Executor]:
             sys.path.extend(folder for folder in path if folder not in sys.path)
 
         def versions() -> dict[str, str]:
-            from cablejax.dataset.opening import package_versions
+            from cablejax.dataset.opening import PACKAGES
+            from cablejax.provenance import package_versions
 
-            return package_versions()
+            return package_versions(PACKAGES)
 
         client.register_worker_callbacks(know_the_experiments)
         _check(cast("dict[str, Any]", client.run(versions, on_error="return")), address)
@@ -128,7 +130,7 @@ class _Opaque(concurrent.futures.Executor):
 def _check(found: dict[str, Any], address: str) -> None:
     if not found:
         raise ExecutorError(f"The cluster at {address} has no workers: start some with `dask worker {address}`.")
-    here = package_versions()
+    here = package_versions(PACKAGES)
     for worker, there in found.items():
         if isinstance(there, BaseException):
             raise ExecutorError(

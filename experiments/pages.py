@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import binomtest
 
-from cablejax.report.provenance import machine, versions
+from cablejax.provenance import machine, versions
 from cablejax.text_file import markdown_table as markdown_table
 
 

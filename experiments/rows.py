@@ -24,7 +24,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from cablejax.report.provenance import machine, versions
+from cablejax.provenance import machine, versions
 from executors import results
 
 MADE_ON = "made_on"

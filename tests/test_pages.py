@@ -1,6 +1,6 @@
 """Pages in Markdown: what is printed is what is written."""
 
-from cablejax.report.provenance import machine, versions
+from cablejax.provenance import machine, versions
 from pages import markdown_table, page_of_results, publish
 
 

@@ -5,7 +5,7 @@ import multiprocessing
 
 import pytest
 
-from cablejax.report.provenance import machine, versions
+from cablejax.provenance import machine, versions
 from rows import Rows, append_row, made_on, read_rows
 
 WANTED = [("a", 1), ("a", 2), ("b", 1), ("b", 2)]

@@ -12,9 +12,9 @@ import numpy as np
 from cablejax.cable import Cable
 from cablejax.control.shaping import Runs
 from cablejax.gaplog import TARGETS, gap_log_from_episodes, write_gap_log
+from cablejax.provenance import machine, versions
 from cablejax.report.animation import write_gif
 from cablejax.report.page import write_page
-from cablejax.report.provenance import machine, versions
 
 
 def summarise(runs: Runs, total_s: float) -> dict[str, Any]:

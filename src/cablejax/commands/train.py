@@ -192,7 +192,7 @@ class Train(Command):
         from cablejax.cable_file import cable_to_fields
         from cablejax.control.cable_inputs import inputs_of_data
         from cablejax.dataset.schema import config_to_json
-        from cablejax.report.provenance import machine, versions
+        from cablejax.provenance import machine, versions
 
         stems = [store.path.name.removesuffix(".zarr") for store in stores]
         names = [stem if stems.count(stem) == 1 else f"{stem} {k + 1}" for k, stem in enumerate(stems)]

@@ -29,7 +29,7 @@ from cablejax.dynamics.evaluate import snapping
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.mpc import MPC, MPCConfig
 from cablejax.perceive.synthetic import Clutter, scatter
-from cablejax.report.provenance import machine
+from cablejax.provenance import machine
 from cablejax.simulate import MjxEngine
 from cablejax.simulate.compile import on_devices
 from cablejax.simulate.elastica import solve_elastica

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +14,6 @@ import zarr
 from zarr.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
-from cablejax import __version__
 from cablejax.dataset.bucket import Bucket, place_of
 from cablejax.dataset.schema import (
     PARAMETERS,
@@ -28,6 +26,7 @@ from cablejax.dataset.schema import (
 )
 from cablejax.dataset.store import Store
 from cablejax.limits import shown
+from cablejax.provenance import package_versions
 from cablejax.text_file import differences, read_json, version_of
 from cablejax.whole_file import draft_folder
 
@@ -125,7 +124,7 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
         ValueError: the folder holds something else, a newer schema version, another configuration, or was begun by
             other package versions. Damaged descriptions of arrays are mended.
     """
-    place, versions = place_of(path), package_versions()
+    place, versions = place_of(path), package_versions(PACKAGES)
     if isinstance(place, Bucket):
         _create_in_bucket(place, config, versions)
     elif place.exists() and not place.is_dir():
@@ -169,17 +168,6 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
 def _changes(stored: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     found = differences(stored, asked).items()
     return "; ".join(f"{name} is {old!r} in the store and {new!r} here" for name, (old, new) in found)
-
-
-def package_versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
-    """Versions of cablejax and of some packages, by default those that decide the content of a data set."""
-    versions = {"cablejax": __version__}
-    for name in packages:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
 
 
 def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import time
 from collections.abc import Callable
 from typing import Any
@@ -22,6 +21,7 @@ from cablejax.diagnose.laws import by_other_laws
 from cablejax.diagnose.protocol import Simulator, explanation
 from cablejax.diagnose.refits import refitted
 from cablejax.diagnose.search import Search, baselines, search
+from cablejax.provenance import package_versions
 
 # Of the noise: the error of its own that a simulator is taken to have if nobody says more.
 _BASELINE = 0.1
@@ -225,5 +225,5 @@ def settings_of(simulator: Simulator, calibration: Calibration) -> dict:
     return {
         "effects": [effect.name for effect in simulator.effects],
         "calibration": dataclasses.asdict(calibration),
-        **{package: importlib.metadata.version(package) for package in ("jax", "mujoco", "numpy")},
+        **package_versions(("jax", "mujoco", "numpy")),
     }

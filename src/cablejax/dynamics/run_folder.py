@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from cablejax.dataset.opening import package_versions
+from cablejax.provenance import package_versions
 from cablejax.text_file import differences, read_json, version_of, write_json
 from cablejax.whole_file import holds_anything, sole_writer
 

@@ -17,6 +17,7 @@ from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, 
 from cablejax.diagnose.judgement import judged, listed, verdict_sentence
 from cablejax.diagnose.protocol import explanation
 from cablejax.gaplog_join import COMMANDS_DERIVED
+from cablejax.provenance import package_versions
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import SpatialCable, errors
@@ -127,7 +128,7 @@ def diagnose_space(
         noise_mm=np.full(windows.n_keypoints, 1e3 * noise),
         noise_correlation=np.zeros(0),
         seconds=time.perf_counter() - begun,
-        settings={"edges": edges, "window_s": longest, "jax": jax.__version__, "devices": jax.default_backend()},
+        settings={"edges": edges, "window_s": longest, **package_versions(("jax",)), "devices": jax.default_backend()},
         identified=found,
     )
 

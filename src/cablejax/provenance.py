@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+from collections.abc import Sequence
 
 import cablejax
 from cablejax.compiled_programs import processor_lines
@@ -12,10 +13,21 @@ from cablejax.compiled_programs import processor_lines
 _PACKAGES = ("jax", "jaxlib", "flax", "mujoco", "mujoco-mjx", "optimistix", "numpy")
 
 
+def package_versions(packages: Sequence[str]) -> dict[str, str]:
+    """Versions of cablejax and of some packages; "not installed" of those that are not."""
+    versions = {"cablejax": cablejax.__version__}
+    for name in packages:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
+
+
 def versions() -> str:
-    """Versions of this package and of those that decide its numbers, in words."""
-    others = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
-    return ", ".join([f"cablejax {cablejax.__version__}", f"Python {platform.python_version()}", *others])
+    """Versions of this package, of Python, and of the packages that decide its numbers, in words."""
+    first, *others = (f"{name} {version}" for name, version in package_versions(_PACKAGES).items())
+    return ", ".join([first, f"Python {platform.python_version()}", *others])
 
 
 def machine() -> str:
