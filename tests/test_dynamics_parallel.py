@@ -14,11 +14,11 @@ import pytest
 
 from cablejax.dataset.windows import draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
-from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.parallel import loss_and_gradient, on_all_devices, training_mesh
 from cablejax.dynamics.run_folder import CHECKPOINTS
 from cablejax.dynamics.train import TrainState, batch_loss, train
 from cablejax.dynamics.train_config import Phase
+from cablejax.dynamics.weights import fingerprint
 from dynamics_cases import SMALL, TINY_TRAINING, as_float64, network, trajectories
 
 DATA = trajectories()

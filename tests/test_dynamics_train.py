@@ -24,7 +24,6 @@ from cablejax.dataset.store import Store
 from cablejax.dataset.streaming import StreamedData
 from cablejax.dataset.windows import draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
-from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.networks import GNS
@@ -32,6 +31,7 @@ from cablejax.dynamics.normalisation import fit_normalisation
 from cablejax.dynamics.run_folder import claim_folder
 from cablejax.dynamics.train import DivergedError, noisy_windows, train
 from cablejax.dynamics.train_config import PRESETS, Phase, TrainConfig
+from cablejax.dynamics.weights import fingerprint
 from dynamics_cases import SMALL, TINY_TRAINING, network, resized, trajectories
 from open_loop import open_loop_error
 

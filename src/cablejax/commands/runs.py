@@ -19,7 +19,7 @@ from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Method, Model, check_fit, enters, not_within_reach, shape_once
 from cablejax.control.targets import Target
 from cablejax.diagnose.judgement import listed
-from cablejax.dynamics.fingerprint import fingerprint
+from cablejax.dynamics.weights import fingerprint
 from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.effects.physics import nominal_physics
 from cablejax.effects.verdicts import effects_of_verdict, posterior_of_verdict

@@ -30,7 +30,6 @@ from cablejax.dataset.windows import Window, draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
 from cablejax.dynamics.config import RECORDED, ModelConfig
 from cablejax.dynamics.evaluate import HORIZONS, evaluation_windows, make_errors
-from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.graph import frame_of
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
@@ -41,6 +40,7 @@ from cablejax.dynamics.parallel import loss_and_gradient, on_all_devices, on_one
 from cablejax.dynamics.run_folder import CHECKPOINTS, claim_folder
 from cablejax.dynamics.symmetry import initially_symmetric, symmetrised
 from cablejax.dynamics.train_config import Phase, TrainConfig
+from cablejax.dynamics.weights import fingerprint
 from cablejax.interrupts import interrupt_flag, saving, unless
 from cablejax.types import Trajectory
 from cablejax.whole_file import sole_writer

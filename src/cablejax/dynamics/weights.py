@@ -13,6 +13,7 @@ and its tensors are the network's, named by their place in it: "processor.0.edge
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib.resources
 import json
 import os
@@ -20,6 +21,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
@@ -195,6 +197,16 @@ def _config_of(content: dict[str, Any], path: Path) -> ModelConfig:
         ) from error
     except ValueError as error:
         raise WeightsError(f"{path} records an impossible configuration: {error}") from error
+
+
+def fingerprint(tree: Any) -> str:
+    """Hash of all arrays of a pytree, with their shapes and dtypes."""
+    digest = hashlib.blake2b(digest_size=16)
+    for leaf in jax.tree.leaves(tree):
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{array.dtype}{array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
 
 
 def _name(key: tuple[Any, ...]) -> str:
