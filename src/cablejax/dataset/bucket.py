@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cablejax.extras import from_extra
+
 if TYPE_CHECKING:
     from obstore.store import S3Store
     from zarr.storage import ObjectStore
@@ -35,17 +37,6 @@ def place_of(path: str | os.PathLike[str] | Bucket) -> Path | Bucket:
     return Bucket(f"s3://{found[1]}") if found else Path(path)
 
 
-def _obstore(url: str) -> Any:
-    """The library of object storage."""
-    try:
-        import obstore
-        import obstore.exceptions
-        import obstore.store
-    except ImportError as error:
-        raise UnreachableError(f"{url} needs obstore: pip install 'cablejax[cluster]'.") from error
-    return obstore
-
-
 @dataclasses.dataclass(frozen=True)
 class Bucket:
     """Objects under one prefix. Address and keys come from AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID and the like.
@@ -66,11 +57,14 @@ class Bucket:
         """The last part of the prefix."""
         return self.url.rpartition("/")[2]
 
+    def _obstore(self, module: str = "obstore") -> Any:
+        return from_extra(module, "cluster", f"{self.url} needs obstore", UnreachableError)
+
     @functools.cached_property
     def _objects(self) -> S3Store:
         endpoint = os.environ.get("AWS_ENDPOINT_URL", "")
         with self.reached():
-            return _obstore(self.url).store.S3Store.from_url(
+            return self._obstore("obstore.store").S3Store.from_url(
                 self.url,
                 client_options={
                     "timeout": "30s",
@@ -90,30 +84,30 @@ class Bucket:
         """One object, or None if there is none of this name."""
         with self.reached():
             try:
-                return bytes(_obstore(self.url).get(self._objects, name).bytes())
+                return bytes(self._obstore().get(self._objects, name).bytes())
             except FileNotFoundError:
                 return None
 
     def write(self, name: str, content: bytes) -> None:
         """Writes one object, over what was there."""
         with self.reached():
-            _obstore(self.url).put(self._objects, name, content)
+            self._obstore().put(self._objects, name, content)
 
     def names(self, prefix: str | None = None) -> list[str]:
         """All objects, or those in a folder of this name."""
         with self.reached():
-            return [item["path"] for batch in _obstore(self.url).list(self._objects, prefix) for item in batch]
+            return [item["path"] for batch in self._obstore().list(self._objects, prefix) for item in batch]
 
     def remove(self, names: list[str]) -> None:
         """Removes objects."""
         with self.reached():
             if names:
-                _obstore(self.url).delete(self._objects, names)
+                self._obstore().delete(self._objects, names)
 
     @contextlib.contextmanager
     def reached(self) -> Iterator[None]:
         """Around requests: raises `UnreachableError` where the storage does not answer or refuses."""
-        refused = _obstore(self.url).exceptions.BaseError
+        refused = self._obstore("obstore.exceptions").BaseError
         try:
             yield
         except FileNotFoundError:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.extras import from_extra
 from cablejax.limits import require
 from cablejax.poses import poses_at, without_misreadings
 from cablejax.recordings.assemble import gap_log_from_takes
@@ -106,16 +107,13 @@ def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
 
 def _messages(path: pathlib.Path, wanted: dict[str, str]) -> tuple[dict[str, list[tuple[float, np.ndarray]]], set[str]]:
     """Time [s] and poses (x, y, z, qw, qx, qy, qz) of every message on the wanted topics, and the frames they name."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ModuleNotFoundError:
-        raise ValueError("Reading bags needs the library rosbags: pip install 'cablejax[recordings]'.") from None
+    what = "Reading bags needs the library rosbags"
+    reading, types = (from_extra(f"rosbags.{part}", "recordings", what) for part in ("highlevel", "typesys"))
     found: dict[str, list[tuple[float, np.ndarray]]] = {topic: [] for topic in wanted}
     frames, size = set(), 0
     try:
         # Bags of older releases hold no message definitions; these messages have been the same in all of them.
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        with reading.AnyReader([path], default_typestore=types.get_typestore(types.Stores.ROS2_HUMBLE)) as bag:
             _require_topics(path, {c.topic: c.msgtype for c in bag.connections}, wanted)
             connections = [c for c in bag.connections if c.topic in wanted]
             for connection, _, data in bag.messages(connections=connections):

@@ -11,7 +11,7 @@ float64. Needs the library pyarrow: `pip install 'cablejax[recordings]'`.
 
 from __future__ import annotations
 
-import importlib
+import functools
 import json
 import os
 import pathlib
@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from cablejax.extras import from_extra
 from cablejax.gaplog import Episode, episodes_of, reading_export, stack_episodes
 from cablejax.gaplog_check import SCHEMA, GapLogError
 from cablejax.limits import require
@@ -43,6 +44,8 @@ _ARRAYS = {
 }
 """Field of an episode in each column of several numbers."""
 
+_pyarrow = functools.partial(from_extra, extra="recordings", what="LeRobot data sets need the library pyarrow")
+
 
 def write_lerobot(folder: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
     """Writes a gap log as a LeRobot data set into a new folder, whole or not at all, and returns its path.
@@ -54,7 +57,7 @@ def write_lerobot(folder: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
         FileExistsError: there is such a folder or file.
         ValueError: the library pyarrow is not installed.
     """
-    arrow, folder = _pyarrow(), pathlib.Path(folder)
+    arrow, folder = _pyarrow("pyarrow"), pathlib.Path(folder)
     if folder.exists():
         raise FileExistsError(f"{folder} exists: give the data set another folder.")
     episodes = episodes_of(log)
@@ -82,7 +85,7 @@ def read_lerobot(folder: str | os.PathLike[str]) -> GapLog:
         GapLogError: the folder is no such data set, damaged, or its log does not follow the format.
         ValueError: the library pyarrow is not installed, or a file is too large.
     """
-    arrow, folder = _pyarrow(), pathlib.Path(folder)
+    arrow, folder = _pyarrow("pyarrow"), pathlib.Path(folder)
     if not (folder / "meta/info.json").is_file():
         raise GapLogError(f"{folder} is no LeRobot data set (no meta/info.json): give its folder.")
     info = read_json(folder / "meta/info.json")
@@ -227,7 +230,7 @@ def _write_tasks(arrow: Any, path: pathlib.Path, tasks: Sequence[str]) -> None:
 
 
 def _write(path: pathlib.Path, table: Any) -> None:
-    parquet = importlib.import_module("pyarrow.parquet")
+    parquet = _pyarrow("pyarrow.parquet")
     with whole_file(path) as stream:
         parquet.write_table(table, stream, compression="snappy")
 
@@ -236,7 +239,7 @@ def _read_table(arrow: Any, paths: Sequence[pathlib.Path]) -> dict[str, np.ndarr
     """The columns of several parquet files, one after the other."""
     if not paths:
         raise GapLogError("The data set has no file data/chunk-000/file-000.parquet. Export the log again.")
-    parquet = importlib.import_module("pyarrow.parquet")
+    parquet = _pyarrow("pyarrow.parquet")
     tables = []
     for path in paths:
         with parquet.ParquetFile(path, pre_buffer=False) as file:
@@ -263,10 +266,3 @@ def _episodes(table: Mapping[str, np.ndarray], features: Mapping[str, Any], moti
         arrays = {field: table[name][rows].reshape(len(rows), *shapes[field]) for name, field in _ARRAYS.items()}
         episodes.append(Episode(motion=motion, time=table["time"][rows], hold=hold[rows], **arrays))
     return episodes
-
-
-def _pyarrow() -> Any:
-    try:
-        return importlib.import_module("pyarrow")
-    except ModuleNotFoundError:
-        raise ValueError("LeRobot data sets need the library pyarrow: pip install 'cablejax[recordings]'.") from None

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import base64
 import collections
-import importlib
+import functools
 import json
 import os
 import pathlib
@@ -22,6 +22,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from cablejax import __version__
+from cablejax.extras import from_extra
 from cablejax.gaplog import Episode, episodes_of, reading_export, stack_episodes
 from cablejax.gaplog_check import SCHEMA, GapLogError
 from cablejax.limits import require
@@ -38,6 +39,8 @@ _LIBRARY = "cablejax "
 _PAUSE = 1_000_000_000
 _FLOAT32 = 7  # in Foxglove's list of numeric types
 
+_mcap = functools.partial(from_extra, extra="recordings", what="MCAP files need the library mcap")
+
 
 def write_mcap(path: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
     """Writes a gap log as an MCAP file, whole or not at all, over what was there, and returns its path.
@@ -45,7 +48,7 @@ def write_mcap(path: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
     Raises:
         ValueError: the library mcap is not installed.
     """
-    library, path = _mcap("writer"), pathlib.Path(path)
+    library, path = _mcap("mcap.writer"), pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as stream:
         writer = library.Writer(stream)
@@ -85,7 +88,7 @@ def read_mcap(path: str | os.PathLike[str]) -> GapLog:
         ValueError: the library mcap is not installed, or the file is too large.
         FileNotFoundError: there is no such file.
     """
-    library, path = _mcap("reader"), pathlib.Path(path)
+    library, path = _mcap("mcap.reader"), pathlib.Path(path)
     if not path.exists():
         raise FileNotFoundError(f"There is no file {path}.")
     if not written_here(path):
@@ -166,13 +169,6 @@ def _pose(pose: np.ndarray) -> dict[str, dict[str, float]]:
         "position": dict(zip("xyz", numbers[:3], strict=True)),
         "orientation": dict(zip("wxyz", numbers[3:], strict=True)),
     }
-
-
-def _mcap(module: str) -> Any:
-    try:
-        return importlib.import_module(f"mcap.{module}")
-    except ModuleNotFoundError:
-        raise ValueError("MCAP files need the library mcap: pip install 'cablejax[recordings]'.") from None
 
 
 def _object(**properties: Any) -> dict[str, Any]:

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.control.run import shape_error_cm
+from cablejax.extras import from_extra
 from cablejax.gaplog import Episode, episodes_of, targets_of
 from cablejax.report.style import LIGHT
 from cablejax.simulate.pose import points_in_space, pose_in_space
@@ -55,7 +56,7 @@ def write_rerun(
     Raises:
         ValueError: the library rerun-sdk is not installed.
     """
-    rr, path = _rerun(), pathlib.Path(path)
+    rr, path = from_extra("rerun", "rerun", "Rerun recordings need the library rerun-sdk"), pathlib.Path(path)
     recording = rr.RecordingStream("cablejax", make_default=False)
     content = recording.binary_stream()
     names = [f"{e}_{re.sub(r'[^A-Za-z0-9_]+', '_', motion)[:40]}" for e, motion in enumerate(log.meta["motion"])]
@@ -130,11 +131,3 @@ def _blueprint(names: list[str]) -> Any:
     errors = rrb.TimeSeriesView(origin="/", name="error [cm]", contents=[f"+ /{name}/error_cm/**" for name in names])
     below = rrb.Horizontal(errors, rrb.TextDocumentView(origin="/about", name="about"), column_shares=[3, 1])
     return rrb.Blueprint(rrb.Vertical(layout, below, row_shares=[2, 1]))
-
-
-def _rerun() -> Any:
-    try:
-        import rerun
-    except ModuleNotFoundError:
-        raise ValueError("Rerun recordings need the library rerun-sdk: pip install 'cablejax[rerun]'.") from None
-    return rerun
