@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from cablejax.arrays import stretches
 from cablejax.cable_length import BENT, ring_chords
+from cablejax.poses import rotated
 from cablejax.types import GapLog
 
 REACH = 5.0
@@ -141,8 +142,8 @@ def cable_fault(log: GapLog) -> str | None:
     dimension = log.keypoints.shape[-1]
     if log.gripper_pose.shape[2] != 2:
         return None
-    valid = np.arange(log.keypoints.shape[1])[None] < log.episode_length[:, None]
-    points, grippers = log.keypoints[valid].astype(float), log.gripper_pose[valid][..., :dimension].astype(float)
+    points, pose = log.keypoints[log.valid].astype(float), log.gripper_pose[log.valid].astype(float)
+    grippers = pose[..., :dimension]
     near = AT_GRIPPER * min(1.0, float(log.meta["cable"]["length_m"]))
     for gripper, (end, name) in enumerate(((0, "0"), (-1, "N - 1"))):
         seen = np.isfinite(points[:, end]).all(axis=-1)
@@ -178,7 +179,7 @@ def setup_fault(log: GapLog) -> str | None:
         return fault
     if log.gripper_pose.shape[2] != 2:
         return None
-    if log.keypoints.shape[-1] == 3:
+    if log.in_space:
         return _axis_fault(log)
     stated = np.diff(log.meta["keypoint_arclength_m"])
     for gripper in (0, 1):
@@ -219,11 +220,9 @@ def _turns_less(angle: Float[np.ndarray, " S"], direction: Float[np.ndarray, " S
 
 def _axis_fault(log: GapLog) -> str | None:
     """Finds grippers in space whose x axis does not leave along the cable."""
-    valid = np.arange(log.keypoints.shape[1])[None] < log.episode_length[:, None]
-    points, pose = log.keypoints[valid].astype(float), log.gripper_pose[valid].astype(float)
+    points, pose = log.keypoints[log.valid].astype(float), log.gripper_pose[log.valid].astype(float)
     for gripper, (end, inner, name) in enumerate(((0, 1, "0"), (-1, -2, "N - 1"))):
-        w, x, y, z = pose[:, gripper, 3:].T
-        axis = np.stack([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
+        axis = rotated(pose[:, gripper, 3:], np.array([1.0, 0.0, 0.0]))
         along = (1, -1)[gripper] * (points[:, inner] - points[:, end])
         with np.errstate(invalid="ignore"):
             cosine = (along * axis).sum(axis=-1) / np.linalg.norm(along, axis=-1)

@@ -171,3 +171,18 @@ class GapLog:
     episode_length: np.ndarray
     meta: dict[str, Any]
     hold: np.ndarray | None = None
+
+    @property
+    def in_space(self) -> bool:
+        """Whether the keypoints have three coordinates; otherwise the cable lies on a table."""
+        return self.keypoints.shape[-1] == 3
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Which samples are no padding, shape [E, T]."""
+        return np.arange(self.time.shape[1]) < self.episode_length[:, None]
+
+    @property
+    def intervals(self) -> np.ndarray:
+        """Times between neighbouring samples of all episodes, in order [s], shape [S]."""
+        return np.diff(self.time, axis=1)[self.valid[:, 1:]]

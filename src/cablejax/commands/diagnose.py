@@ -65,7 +65,7 @@ class Diagnose(Command):
                 )
         read = [read_gap_log(path) for path in self.logs]
         log = read[0] if len(read) == 1 else joined(read, [str(path) for path in self.logs])
-        if _in_space(log):
+        if log.in_space:
             self._check_space()
         else:
             self._check_plane()
@@ -144,7 +144,7 @@ def diagnose_and_report(
     from cablejax.diagnose.motion_file import write_motion
     from cablejax.report.diagnosis_page import write_diagnosis_page
 
-    if _in_space(log):
+    if log.in_space:
         from cablejax.spatial.diagnose import diagnose_space
 
         spatial = diagnose_space(log, only=only or None, state=state, progress=say)
@@ -158,7 +158,3 @@ def diagnose_and_report(
     )
     write_motion(folder, result.next_motion, result.log)
     return result, write_diagnosis_page(result, folder)
-
-
-def _in_space(log: GapLog) -> bool:
-    return log.keypoints.shape[-1] == 3

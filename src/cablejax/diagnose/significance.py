@@ -40,7 +40,7 @@ def variance_inflation(whitened: Float[np.ndarray, "E T N 2"], log: GapLog, hold
             count += piece.shape[1]
             samples += np.isfinite(piece).sum()
     if count == 0 or products[0] <= 0:
-        steps = np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
+        steps = log.intervals
         return 1.0 + (_DEFAULT_CORRELATION / float(np.median(steps)) if len(steps) else 0.0)
     rho = products[1:] / products[0]
     # scatter alone is no correlation

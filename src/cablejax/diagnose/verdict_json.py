@@ -98,11 +98,10 @@ def _cable(diagnosis: Diagnosis) -> dict[str, Any] | None:
 
 def _place(diagnosis: Diagnosis) -> list[float] | None:
     """Of the grippers on a table [m]; None in space, and of a simulator of one's own."""
-    if not isinstance(diagnosis, CableDiagnosis) or diagnosis.log.keypoints.shape[-1] != 2:
+    if not isinstance(diagnosis, CableDiagnosis) or diagnosis.log.in_space:
         return None
     log = diagnosis.log
-    valid = np.arange(log.gripper_pose.shape[1]) < log.episode_length[:, None]
-    return (np.round(log.gripper_pose[valid][..., :2].mean(axis=(0, 1), dtype=float), 2) + 0.0).tolist()
+    return (np.round(log.gripper_pose[log.valid][..., :2].mean(axis=(0, 1), dtype=float), 2) + 0.0).tolist()
 
 
 def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib.Path:

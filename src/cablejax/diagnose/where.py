@@ -97,7 +97,7 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
     noise = np.broadcast_to(np.asarray(noise, np.float64), nominal.shape[2])
     if not (np.isfinite(noise) & (noise > 0)).all():
         raise ValueError(f"noise is {noise} m, expected positive finite standard deviations.")
-    valid = np.arange(nominal.shape[1]) < log.episode_length[:, None]
+    valid = log.valid
     residual = np.where(valid[..., None, None], log.keypoints.astype(np.float64) - nominal, np.nan)
     if not np.isfinite(residual).any():
         raise ValueError("No keypoint is both observed and simulated, so there is no gap to locate.")

@@ -178,20 +178,19 @@ def _statistics(column: np.ndarray) -> dict[str, list[float]]:
 
 
 def _info(log: GapLog, features: Mapping[str, Any], frames: int, tasks: int) -> dict[str, Any]:
-    steps = [np.diff(episode.time) for episode in episodes_of(log)]
-    usual = float(np.median(np.concatenate(steps))) if any(map(len, steps)) else 1.0
-    rate = 1.0 / usual
+    steps, episodes = log.intervals, len(log.episode_length)
+    rate = 1.0 / float(np.median(steps)) if len(steps) else 1.0
     return {
         "codebase_version": VERSION,
         "robot_type": "two grippers that hold a cable",
-        "total_episodes": len(steps),
+        "total_episodes": episodes,
         "total_frames": frames,
         "total_tasks": tasks,
         "chunks_size": 1000,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": round(rate) if abs(rate - round(rate)) < 1e-3 * rate else rate,
-        "splits": {"train": f"0:{len(steps)}"},
+        "splits": {"train": f"0:{episodes}"},
         "data_path": f"data/{_FILE}",
         "video_path": None,
         "features": features,

@@ -17,7 +17,6 @@ from cablejax.gaplog import SIMULATED, write_gap_log
 from cablejax.report import diagnosis_sections as sections
 from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import cable_figure, where_figure
-from cablejax.report.diagnosis_sections import in_space
 from cablejax.report.effect_words import (
     MOTIONS,
     between,
@@ -87,7 +86,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
     simulated = {name: getattr(diagnosis, name) for name in SIMULATED}
     given = {name: points for name, points in simulated.items() if points is not None}
     write_gap_log(out / SIMULATIONS, diagnosis.log, overwrite=True, simulated=given)
-    space = in_space(diagnosis)
+    space = diagnosis.log.in_space
     drawn = {
         "cable": cable_still(diagnosis) if space else cable_figure(diagnosis),
         "where": files_figure(diagnosis) if space else where_figure(diagnosis),
@@ -228,7 +227,7 @@ def _chance(diagnosis: CableDiagnosis) -> str:
 
 def _least(diagnosis: CableDiagnosis) -> float:
     """The gap [mm] from which on the verdict would not have been "none"."""
-    if in_space(diagnosis):
+    if diagnosis.log.in_space:
         return diagnosis.where.smallest_mm
     calibration = Calibration(**diagnosis.settings.get("calibration", {}))
     noise = float(np.sqrt(np.mean(diagnosis.noise_mm**2)))

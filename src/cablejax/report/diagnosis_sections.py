@@ -35,11 +35,6 @@ Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 """A heading, the names of the columns, and the rows."""
 
 
-def in_space(diagnosis: CableDiagnosis) -> bool:
-    """Whether the cable hangs in space, rather than lying on a table."""
-    return diagnosis.log.keypoints.shape[-1] == 3
-
-
 def named_effects(diagnosis: Diagnosis) -> list[tuple[NamedEffect, str, list[tuple[str, str]]]]:
     """Each named effect with its place, parameters and estimates."""
     found = []
@@ -161,7 +156,7 @@ def how_far(diagnosis: CableDiagnosis) -> str:
         interval = ""
         if gap.shrinkage_ci90 is not None:
             interval = f" (90 % interval over episodes: {between(*gap.shrinkage_ci90)})"
-        besides = " plus constant offsets of the markers" if in_space(diagnosis) else ""
+        besides = " plus constant offsets of the markers" if diagnosis.log.in_space else ""
         text = (
             f"With {added} in the simulator, {share(gap.shrinkage)} of the squared gap above the noise goes "
             f"away{interval}, on {named}, each left out of the fit that predicts it. The error falls from "
@@ -180,7 +175,7 @@ def how_far(diagnosis: CableDiagnosis) -> str:
 
 def nothing_next(diagnosis: CableDiagnosis) -> str:
     """Why no motion is recommended."""
-    if in_space(diagnosis):
+    if diagnosis.log.in_space:
         return "No motion was evaluated: this version recommends motions only for cables on a table."
     settled = diagnosis.verdict in ("none", "named")
     return "No explanations are left to separate." if settled else "No motion of the library would help."

@@ -28,12 +28,11 @@ _MOMENTS = 5
 
 def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
     """What a gap log holds; `exported` is the format of one that has to be imported first, as the command has it."""
-    episodes, targets, planar = episodes_of(log), targets_of(log), log.keypoints.shape[-1] == 2
+    episodes, targets, planar = episodes_of(log), targets_of(log), not log.in_space
     cable = dataclasses.replace(config_of_log(log).cable, diameter=log.meta["cable"]["diameter_m"])
     seconds = sum(float(episode.time[-1] - episode.time[0]) for episode in episodes)
     seen = np.concatenate([np.isfinite(episode.keypoints).all(axis=-1) for episode in episodes])
-    steps = np.concatenate([np.diff(episode.time) for episode in episodes])
-    points = np.concatenate([episode.keypoints for episode in episodes])
+    points, steps = np.concatenate([episode.keypoints for episode in episodes]), log.intervals
     noise, how = _noise(log)
     file = shlex.quote(name)
     # a few episodes, evenly over the log
@@ -80,12 +79,9 @@ _COURSE = "Speed of the faster gripper, and distance of the keypoints to the tar
 
 def _noise(log: GapLog) -> tuple[str, str]:
     """The noise of one coordinate in words, and what it was estimated from."""
-    points = np.array(log.keypoints, float)
-    for row, length in zip(points, log.episode_length, strict=True):
-        row[length:] = np.nan
-    planar = points.shape[-1] == 2
+    points = np.where(log.valid[..., None, None], log.keypoints.astype(float), np.nan)
     try:
-        floor = noise_floor(points, log.hold, order=3) if planar else noise_floor(points, None, order=4)
+        floor = noise_floor(points, None, order=4) if log.in_space else noise_floor(points, log.hold, order=3)
     except ValueError:
         return "not known", "the log is too short to separate noise from motion"
     source = "scatter while the grippers rest" if floor.from_holds else "scatter between neighbouring samples"

@@ -90,8 +90,7 @@ def orbit_data(diagnosis: CableDiagnosis) -> dict[str, Any]:
     used = np.flatnonzero(np.isfinite(size))
     order = used[np.argsort(-size[used])]
     chosen = list(dict.fromkeys(order[np.linspace(0, len(order) - 1, _SHOWN).round().astype(int)].tolist()))
-    between = [np.diff(time[:count]) for time, count in zip(log.time, log.episode_length, strict=True)]
-    interval = float(np.median(np.concatenate(between)))
+    interval = float(np.median(log.intervals))
     every = max(1, round(_FRAME / interval))
 
     def whole(points):

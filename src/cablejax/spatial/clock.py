@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
 
 from cablejax.diagnose.clock import keypoints_at
 from cablejax.diagnose.log_faults import clock_offset
@@ -21,11 +20,6 @@ _SAME_RATE = 0.003
 _RATE = 75.0
 
 
-def steps_of(log: GapLog) -> Float[np.ndarray, " S"]:
-    """Times between samples, of all episodes [s]."""
-    return np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
-
-
 def thinned(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     """Averages groups of samples of a log with a high sample rate, and returns a sentence on it.
 
@@ -35,7 +29,7 @@ def thinned(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     Args:
         log: its samples one interval apart.
     """
-    steps = steps_of(log)
+    steps = log.intervals
     count = int(1.0 / (_RATE * np.median(steps)) + 1e-6) if len(steps) else 1
     if count < 2:
         return log, ()
@@ -80,7 +74,7 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         repairs += [f"In episode {e} the pose of gripper {q} {words}" for q, words in jumps.items()]
     if repairs:
         log = dataclasses.replace(log, gripper_pose=pose)
-    steps = steps_of(log)
+    steps = log.intervals
     interval = float(np.median(steps)) if len(steps) else 0.0
     if not len(steps):
         return log, tuple(repairs)
@@ -123,7 +117,7 @@ def with_poses_in_time(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     Args:
         log: its samples one interval apart.
     """
-    steps = steps_of(log)
+    steps = log.intervals
     interval = np.full(len(log.time), np.median(steps) if len(steps) else 1.0)
     ends, place = log.keypoints[:, :, [0, -1]].astype(float), log.gripper_pose[..., :3].astype(float)
     offset = clock_offset(ends, place, log.episode_length, interval)

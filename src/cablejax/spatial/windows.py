@@ -15,7 +15,6 @@ from cablejax.diagnose.noise import noise_floor
 from cablejax.gaplog import labels
 from cablejax.log_geometry import cable_fault
 from cablejax.poses import rotated
-from cablejax.spatial.clock import steps_of
 from cablejax.spatial.grips import clamps, frames_of, held_keypoints, rolls_observed
 from cablejax.types import GapLog
 
@@ -145,7 +144,7 @@ def windows_of(log: GapLog) -> Windows:
     samples = min(round(WINDOW / interval), int(log.episode_length.max()))
     points = np.asarray(log.keypoints, float)
     pose = np.asarray(log.gripper_pose, float)
-    valid = np.arange(points.shape[1]) < log.episode_length[:, None]
+    valid = log.valid
     tangent = rotated(pose[..., 3:], np.array([1.0, 0.0, 0.0]))
     s = np.asarray(log.meta["keypoint_arclength_m"], float)
     held = held_keypoints(points, pose[..., :3], tangent, valid, s)
@@ -223,14 +222,14 @@ def _pieces(
 
 def _sample_interval(log: GapLog) -> float:
     """The one sample interval [s] of a log that has passed all checks, see `windows_of`."""
-    if log.keypoints.shape[-1] != 3 or log.gripper_pose.shape[2] != 2:
+    if not log.in_space or log.gripper_pose.shape[2] != 2:
         raise ValueError(
             f"The log has keypoints in {log.keypoints.shape[-1]} dimensions and {log.gripper_pose.shape[2]} grippers, "
             "expected a cable in space (3) between two grippers."
         )
     if log.meta["table"] is not None:
         raise ValueError("The log has a table; a cable in space is expected to hang free (`table` null).")
-    intervals = steps_of(log)
+    intervals = log.intervals
     interval = float(np.median(intervals))
     if np.abs(intervals - interval).max() > 0.05 * interval:
         raise ValueError(
