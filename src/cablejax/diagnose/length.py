@@ -54,20 +54,20 @@ class Length(Reading):
         """See `Reading`."""
         return f"the cable is {self.measured:.4g} m long, not {self.stated:.4g} m as stated"
 
-    def told(self, diagnosis, probability):
+    def caveat(self, probability):
         """See `Reading`."""
-        caveat = (
+        return (
             f"Keypoints are {self.apart}. A cable length of {self.measured:.4g} m explains this log better than any "
             f"effect on a cable of the stated {self.stated:.4g} m (probability {probability:.2f}), so the diagnosis "
             "assumes that length. Measure the cable between the grippers, and correct length_m and "
             "keypoint_arclength_m."
         )
-        return dataclasses.replace(
-            diagnosis,
-            sentence=f"{diagnosis.sentence} This assumes that {self.assumes}.",
-            caveats=(caveat, *diagnosis.caveats),
-            quantities={**diagnosis.quantities, "length_m": ParameterEstimate(self.measured, None, "m")},
-        )
+
+    def told(self, diagnosis, probability):
+        """With the measured length among the quantities."""
+        measured = {"length_m": ParameterEstimate(self.measured, None, "m")}
+        told = super().told(diagnosis, probability)
+        return dataclasses.replace(told, quantities=told.quantities | measured)
 
 
 def other_length(case: Case, log: GapLog) -> Length | None:

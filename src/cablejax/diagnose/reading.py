@@ -33,8 +33,16 @@ class Reading(abc.ABC):
     case: Case | None
 
     @abc.abstractmethod
+    def caveat(self, probability: float) -> str:
+        """What was assumed and why, with its probability among all laws."""
+
     def told(self, diagnosis: CableDiagnosis, probability: float) -> CableDiagnosis:
         """A diagnosis made with this reading, with a sentence that says so."""
+        return dataclasses.replace(
+            diagnosis,
+            sentence=f"{diagnosis.sentence} This assumes that {self.assumes}.",
+            caveats=(self.caveat(probability), *diagnosis.caveats),
+        )
 
     def probability(self, laws: Sequence[UnderLaw]) -> float:
         """Of this reading, among all laws that were tried; 0 where it was not tried."""
@@ -63,17 +71,12 @@ class Held(Reading):
 
     assumes = "the cable starts in its first observed shape, held there by the table"
 
-    def told(self, diagnosis, probability):
+    def caveat(self, probability):
         """See `Reading`."""
-        caveat = (
+        return (
             f"At the start, keypoints are up to {1e3 * self.off:.2g} mm from where the simulated cable would settle. A "
             "cable that starts in its first observed shape, held there by the table's friction, explains this log best "
             f"(probability {probability:.2f}), so it is simulated in this way."
-        )
-        return dataclasses.replace(
-            diagnosis,
-            sentence=f"{diagnosis.sentence} This assumes that {self.assumes}.",
-            caveats=(caveat, *diagnosis.caveats),
         )
 
 
