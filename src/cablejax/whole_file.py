@@ -20,8 +20,8 @@ _ABANDONED = 24 * 3600
 
 
 def holds_anything(folder: pathlib.Path) -> bool:
-    """Whether a folder holds anything except drafts that a killed process left."""
-    return any(not file.name.endswith(DRAFT) for file in folder.iterdir())
+    """Whether there is a folder that holds anything except drafts that a killed process left."""
+    return folder.is_dir() and any(not file.name.endswith(DRAFT) for file in folder.iterdir())
 
 
 @contextlib.contextmanager

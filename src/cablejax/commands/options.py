@@ -79,7 +79,7 @@ def output_folder(path: pathlib.Path, *, overwrite: bool) -> pathlib.Path:
     """
     if path.exists() and not path.is_dir():
         raise UsageError(f"--out is {path}, which is a file; expected a folder. Name another one.")
-    if path.is_dir() and holds_anything(path) and not overwrite:
+    if holds_anything(path) and not overwrite:
         raise UsageError(f"{path} exists and is not empty. Give another folder with --out, or add --overwrite.")
     path.mkdir(parents=True, exist_ok=True)
     return path

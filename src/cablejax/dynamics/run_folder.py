@@ -67,7 +67,7 @@ def claim_folder(
                 "folder, repeat it with the same configuration and data, or overwrite it (--overwrite)."
             )
         _discard(out_dir)
-    elif out_dir.is_dir() and holds_anything(out_dir):
+    elif holds_anything(out_dir):
         if not overwrite:
             raise ValueError(
                 f"{out_dir} exists and is not empty, and holds no training. Choose another folder, or write among its "
