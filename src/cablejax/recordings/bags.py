@@ -15,10 +15,8 @@ from jaxtyping import Float
 from cablejax.extras import from_extra
 from cablejax.limits import require
 from cablejax.poses import poses_at, without_misreadings
-from cablejax.recordings.assemble import gap_log_from_takes
 from cablejax.recordings.layout import Fields, Layout, read_layout
 from cablejax.recordings.mcap_log import MAGIC
-from cablejax.recordings.prepare import prepare
 from cablejax.recordings.table import unit_quaternions
 from cablejax.recordings.take import Take
 from cablejax.types import GapLog
@@ -54,10 +52,7 @@ def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) ->
     _require_bag(path)
     how = read_layout(layout, "topics")
     take, misread = _take(path, how)
-    takes, repairs = prepare((take,), how.setup)
-    repairs = [*misread, *repairs]
-    measured = take.gripper_pose is not None
-    return gap_log_from_takes(takes, how.nominal, source=how.source, repairs=repairs, measured=measured), repairs
+    return how.log_of((take,), misread)
 
 
 def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:

@@ -9,13 +9,16 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 from cablejax.limits import LIMITS, require, shown
-from cablejax.recordings.assemble import Nominal
+from cablejax.recordings.assemble import Nominal, gap_log_from_takes
 from cablejax.recordings.frames import Frame
-from cablejax.recordings.prepare import Setup
+from cablejax.recordings.prepare import Setup, prepare
+from cablejax.recordings.take import Take
 from cablejax.text_file import read_toml
+from cablejax.types import GapLog
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +38,13 @@ class Layout:
     source: str
     place: Fields
     path: pathlib.Path
+
+    def log_of(self, takes: tuple[Take, ...], repairs: Sequence[str]) -> tuple[GapLog, list[str]]:
+        """The gap log of takes as read, checked and repaired, and a sentence on each repair, after those given."""
+        measured = all(take.gripper_pose is not None for take in takes)
+        takes, more = prepare(takes, self.setup)
+        repairs = [*repairs, *more]
+        return gap_log_from_takes(takes, self.nominal, source=self.source, repairs=repairs, measured=measured), repairs
 
 
 class Fields:

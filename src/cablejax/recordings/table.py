@@ -13,9 +13,7 @@ import pathlib
 import numpy as np
 
 from cablejax.limits import require, shown
-from cablejax.recordings.assemble import gap_log_from_takes
 from cablejax.recordings.layout import Fields, Layout, read_layout
-from cablejax.recordings.prepare import prepare
 from cablejax.recordings.take import Take
 from cablejax.text_file import read_text
 from cablejax.types import GapLog
@@ -58,12 +56,7 @@ def import_csv(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> 
             guessing; names it.
     """
     how = read_layout(layout, "columns")
-    takes, unread = _takes(pathlib.Path(path), how)
-    measured = all(take.gripper_pose is not None for take in takes)
-    takes, repairs = prepare(takes, how.setup)
-    repairs = [*unread, *repairs]
-    log = gap_log_from_takes(takes, how.nominal, source=how.source, repairs=repairs, measured=measured)
-    return log, repairs
+    return how.log_of(*_takes(pathlib.Path(path), how))
 
 
 def _takes(path: pathlib.Path, how: Layout) -> tuple[tuple[Take, ...], list[str]]:
