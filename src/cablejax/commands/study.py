@@ -143,14 +143,10 @@ def finished_rounds(state: pathlib.Path) -> int:
             if read_verdict_json(folder / "verdict.json")["next_motion"] is not None:
                 read_gap_log(folder / "next_motion.npz")
         return rounds
-    except FileNotFoundError as error:
-        if not state.exists():
-            return 0
-        why = error
-    except (ValueError, TypeError, KeyError) as error:
-        why = error
-    say(f"Round {number + 1} was kept, but is damaged and made again: {why}")
-    return number
+    except (FileNotFoundError, ValueError, TypeError, KeyError) as error:
+        if state.exists():
+            say(f"Round {number + 1} was kept, but is damaged and made again: {error}")
+        return number
 
 
 def remove_rounds(out: pathlib.Path, kept: int) -> None:

@@ -39,13 +39,20 @@ class View(Command):
     def execute(self):
         """Recognises the file or folder, writes its page and prints the path."""
         kind, path = kind_of(self.artefact)
-        page = self._page(kind, path)
-        if kind == "run" and self.out is None:
-            title = "The page of a run."
-        else:
+        page, title = self._page(kind, path), "The page of a run."
+        if kind != "run" or self.out is not None:
             if page.suffix.lower() not in (".html", ".htm"):
                 raise UsageError(f"--out is {page}, expected a file name that ends in .html.")
-            title = self._write(kind, path, output_file(page, overwrite=self.overwrite))
+            output_file(page, overwrite=self.overwrite)
+            if kind == "run":
+                page.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path / PAGE, page)
+            else:
+                from cablejax.report.sheet import write_sheet
+
+                sheet = sheet_of(kind, path)
+                write_sheet(page, sheet)
+                title = f"{sheet.kind.capitalize()}: {sheet.title}"
         if self.browser:
             import webbrowser
 
@@ -60,18 +67,6 @@ class View(Command):
             return path / PAGE
         named = path.resolve() if path.name in ("", "..") else path
         return named.with_name(f"{named.stem}.html")
-
-    def _write(self, kind: Kind, path: pathlib.Path, page: pathlib.Path) -> str:
-        """Writes the page and returns its title."""
-        if kind == "run":
-            page.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path / PAGE, page)
-            return "The page of a run."
-        from cablejax.report.sheet import write_sheet
-
-        sheet = sheet_of(kind, path)
-        write_sheet(page, sheet)
-        return f"{sheet.kind.capitalize()}: {sheet.title}"
 
 
 def sheet_of(kind: Kind, path: pathlib.Path) -> Sheet:
