@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from cablejax.arrays import positions_at
 from cablejax.gaplog import Episode
@@ -56,14 +56,12 @@ def on_even_clock(episode: Episode, interval: float) -> Episode:
         interval: of the new clock [s].
     """
     time = episode.time - episode.time[0]
-    grid = np.arange(int(np.floor(time[-1] / interval + 1e-6)) + 1) * interval
+    grid, before, after = even_times(time, interval)
     held = np.diff(time)[:, None, None]
     done = np.diff(episode.gripper_pose, axis=0)
     steps = np.where(held <= _GAP * interval, episode.gripper_command[:-1] * held, done)
     path = np.concatenate([np.zeros((1, 2, 3)), np.cumsum(steps, axis=0)])
     commanded = np.diff(positions_at(grid, time, path), axis=0) / interval
-    before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, len(time) - 1)
-    after = np.minimum(before + 1, len(time) - 1)
     return dataclasses.replace(
         episode,
         time=grid,
@@ -72,6 +70,15 @@ def on_even_clock(episode: Episode, interval: float) -> Episode:
         gripper_command=np.concatenate([commanded, np.zeros((1, 2, 3))]),
         hold=episode.hold[before] & episode.hold[after],
     )
+
+
+def even_times(
+    time: Float[np.ndarray, "T"], interval: float
+) -> tuple[Float[np.ndarray, "G"], Int[np.ndarray, "G"], Int[np.ndarray, "G"]]:
+    """The times of an even clock from 0 to the end [s], and for each the samples before and after it."""
+    grid = np.arange(int(np.floor(time[-1] / interval + 1e-6)) + 1) * interval
+    before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, len(time) - 1)
+    return grid, before, np.minimum(before + 1, len(time) - 1)
 
 
 def keypoints_at(

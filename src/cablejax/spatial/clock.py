@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from cablejax.diagnose.clock import keypoints_at
+from cablejax.diagnose.clock import even_times, keypoints_at
 from cablejax.diagnose.log_faults import clock_offset
 from cablejax.gaplog import episodes_of, stack_episodes
 from cablejax.poses import poses_at, with_one_sign, without_misreadings
@@ -86,8 +86,7 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     episodes = []
     for one in episodes_of(log):
         time = one.time - one.time[0]
-        grid = interval * np.arange(int(np.floor(time[-1] / interval + 1e-6)) + 1)
-        before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, len(time) - 1)
+        grid, before, after = even_times(time, interval)
         points = one.keypoints.astype(float)
         if len(time) > 1:
             # an episode may be slower than the clock: a gap is one in its own clock
@@ -98,7 +97,7 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
             keypoints=points,
             gripper_pose=poses_at(grid, time, one.gripper_pose),
             gripper_command=one.gripper_command[before],
-            hold=one.hold[before] & one.hold[np.minimum(before + 1, len(time) - 1)],
+            hold=one.hold[before] & one.hold[after],
         )
         episodes.append(even)
     report = (

@@ -141,8 +141,8 @@ def _share(verdict: Verdict, gap: Gap, of_all_effects: Callable[[], Gap]) -> flo
 def _to_fit(log: GapLog) -> tuple[Windows, int]:
     """The windows that may be fitted, and how many may not."""
     windows = windows_of(log)
-    fitted = [i for i, split in enumerate(windows.split) if split != "eval"]
-    if not fitted:
+    fitted = windows.fitted
+    if not len(fitted):
         raise ValueError(
             "All windows are in the eval split, which is never fitted: record more, or label other windows for fitting."
         )
@@ -151,7 +151,7 @@ def _to_fit(log: GapLog) -> tuple[Windows, int]:
             f"The log has one window to fit, of {windows.valid.sum(axis=1).max() * windows.interval:.3g} s, expected "
             "at least two, so that one can be left out of a fit. Record more."
         )
-    return windows.chosen(fitted), len(windows) - len(fitted)
+    return fitted, len(windows) - len(fitted)
 
 
 def _simulated(after: Float[np.ndarray, "W T F 3"], windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -173,11 +173,9 @@ def with_roll(log: GapLog) -> GapLog:
     stiffness = cable["bending_stiffness_n_m2"] / cable["linear_density_kg_per_m"]
     told = dataclasses.replace(log, meta={**log.meta, "roll_observed": True})
     for one in (log, told):
-        windows = windows_of(one)
-        fitted = [i for i, split in enumerate(windows.split) if split != "eval"]
-        if not fitted:
+        windows = windows_of(one).fitted
+        if not len(windows):
             return log
-        windows = windows.chosen(fitted)
         windows = windows.chosen(windows.whole(_COMPARED))
         layout = layout_of(windows, stiffness, cable["bending_damping_s"])
         motion = SpatialCable(Rod(EDGES, 1, twisting=False), layout, windows).motion(explanation())

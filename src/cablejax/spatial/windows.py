@@ -90,6 +90,11 @@ class Windows:
         return whole[np.unique(np.linspace(0, len(whole) - 1, count).astype(int))]
 
     @property
+    def fitted(self) -> Windows:
+        """Those that may be fitted: all that are not labelled "eval"."""
+        return self.chosen([i for i, split in enumerate(self.split) if split != "eval"])
+
+    @property
     def observed(self) -> Float[np.ndarray, "W T F 3"]:
         """The keypoints, NaN also where nothing is recorded."""
         return np.where(self.valid[:, :, None, None], self.keypoints, np.nan)
