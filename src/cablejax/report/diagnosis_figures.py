@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
+from scipy.signal import convolve
 
 from cablejax.arrays import stretches
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
@@ -145,13 +146,10 @@ def _smoothed(diagnosis: CableDiagnosis, episode: int) -> np.ndarray:
     squared = diagnosis.where.heat[episode, :length] ** 2
     width = max(1, round(_SMOOTHING_S / _interval(diagnosis, episode)))
     seen = np.isfinite(squared)
-    kernel = np.ones(min(width, length))
-    sums = np.stack(
-        [np.convolve(np.where(seen, squared, 0.0)[:, n], kernel, mode="same") for n in range(squared.shape[1])]
-    )
-    counts = np.stack([np.convolve(seen[:, n].astype(float), kernel, mode="same") for n in range(squared.shape[1])])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.sqrt(np.maximum(sums / np.where(counts > 0, counts, np.nan) - 1.0, 0.0)).T
+    kernel = np.ones((min(width, length), 1))
+    sums, counts = (convolve(part, kernel, "same", "direct") for part in (np.where(seen, squared, 0.0), seen))
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(np.maximum(sums / np.where(counts > 0, counts, np.nan) - 1.0, 0.0))
 
 
 def _strip(ax: Axes, diagnosis: CableDiagnosis, arclength: np.ndarray) -> None:

@@ -91,9 +91,8 @@ def cable_cards(cable: Cable, *, on_table: bool = True) -> list[tuple[str, str, 
 
 def cable_facts(cable: Cable) -> dict[str, str]:
     """Every number of a cable's file, with its unit."""
-    fields = cable_to_fields(cable)
     units = {key: LIMITS[field].unit for key, (field, _) in NUMBERS.items()}
-    return {key: f"{value} {units.get(key, '')}".strip() for key, value in fields.items()}
+    return {key: f"{value} {units.get(key, '')}".strip() for key, value in cable_to_fields(cable).items()}
 
 
 LETTERS_CAPTION = "This cable as a U, an S and a Z between two grippers, at rest and without friction. Dots: keypoints."

@@ -9,6 +9,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from scipy.special import expit
 
 from cablejax.arrays import wrapped
 from cablejax.simulate.chain.step import SLIP_DURATION, kept_bends
@@ -26,8 +27,7 @@ class Extension:
 
     def slipped(self, time: float) -> Float[np.ndarray, "2"]:
         """Free length that has come in through either gripper until then [m]."""
-        late = np.clip((time - float(self._physics.slip_time)) / SLIP_DURATION, -50.0, 50.0)
-        return np.asarray(self._physics.slip) / (1.0 + np.exp(-late))
+        return np.asarray(self._physics.slip) * expit((time - float(self._physics.slip_time)) / SLIP_DURATION)
 
     def update(self, time: float) -> None:
         """Sets the springs for a step that ends at this time [s]."""
