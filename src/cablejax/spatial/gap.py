@@ -15,8 +15,7 @@ from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.gap import measure_gap
 from cablejax.diagnose.noise import noise_floor
 from cablejax.diagnose.protocol import explanation
-from cablejax.diagnose.where import HORIZONS, Where, above
-from cablejax.diagnose.where_sizes import sizes_of
+from cablejax.diagnose.where import HORIZONS, Where, above, sizes_of
 from cablejax.gaplog import labels
 from cablejax.spatial.cable import MORE_EDGES, SpatialCable, bounded
 from cablejax.spatial.windows import Windows

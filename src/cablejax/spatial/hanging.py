@@ -30,7 +30,7 @@ from cablejax.diagnose.protocol import Explanation, Plan, Report, Simulator, Ter
 from cablejax.diagnose.refits import refitted
 from cablejax.diagnose.run import Examined, examine, settings_of, weighed
 from cablejax.diagnose.verdict_json import verdict_json
-from cablejax.diagnose.where_sizes import sizes_of
+from cablejax.diagnose.where import sizes_of
 from cablejax.spatial.hanging_effects import CLAMP_ANGLE, EFFECTS, wire_shape
 
 LINKS_PER_SPACING = 2
