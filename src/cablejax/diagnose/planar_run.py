@@ -127,7 +127,9 @@ def _constants(
     """The constants of the judgement, and what wrongly stated numbers make of them [m]; 0 with constants given."""
     calibration, stated = given or calibrated(log.meta["cable"]["length_m"]), 0.0
     if commissioning:
-        calibration = dataclasses.replace(calibration, baseline=_commissioned(log, commissioning))
+        # of the log's set-up, and none the log itself
+        joined([log, *commissioning], ["the log", *(f"commissioning log {i + 1}" for i in range(len(commissioning)))])
+        calibration = dataclasses.replace(calibration, baseline=baseline_error(commissioning))
     if given is None:
         stated = case.stated_error()
         assumed = float(np.linalg.norm([calibration.baseline, stated, case.pose_error()]))
@@ -194,12 +196,6 @@ def _following(judge: Judge, design: DesignConfig | None) -> tuple[NextMotion | 
 def calibrated(length: float) -> Calibration:
     """The constants for a cable of this length [m]. They were set on cables of about 1 m; longer ones err by more."""
     return Calibration(baseline=Calibration.baseline * max(1.0, length))
-
-
-def _commissioned(log: GapLog, commissioning: Sequence[GapLog]) -> float:
-    """`baseline_error` of logs that are of the log's set-up, and none the log itself, or else a `ValueError`."""
-    joined([log, *commissioning], ["the log", *(f"commissioning log {i + 1}" for i in range(len(commissioning)))])
-    return baseline_error(commissioning)
 
 
 def baseline_error(logs: Sequence[GapLog]) -> float:

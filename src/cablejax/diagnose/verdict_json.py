@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 import pathlib
@@ -27,7 +26,7 @@ from cablejax.diagnose.diagnosis import (
 )
 from cablejax.effects.verdicts import VERDICT_SCHEMA, read_verdict_json
 from cablejax.limits import LIMITS, shown
-from cablejax.whole_file import whole_file
+from cablejax.text_file import write_json
 
 if TYPE_CHECKING:
     from cablejax.diagnose.where import Where
@@ -107,10 +106,8 @@ def _place(diagnosis: Diagnosis) -> list[float] | None:
 def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib.Path:
     """Writes the verdict, whole or not at all, over what was there, and returns its path."""
     path = pathlib.Path(path)
-    text = json.dumps(verdict_json(diagnosis), indent=1, allow_nan=False) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as stream:
-        stream.write(text.encode())
+    write_json(path, verdict_json(diagnosis))
     return path
 
 

@@ -100,10 +100,6 @@ def _reconstruct(subtype: Any, shape: Any, code: Any) -> _Array:
     return _Array()
 
 
-def _scalar(kind: Any, data: Any) -> np.ndarray:
-    return _from_buffer(data, kind, ())
-
-
 def _encode(text: Any, encoding: Any = "latin1") -> bytes:
     if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
         raise UnsafePickleError(
@@ -144,7 +140,7 @@ _NAMES: dict[tuple[str, str], _Name] = {
         for core in ("numpy.core", "numpy._core")
         for module, name, function in (
             ("multiarray", "_reconstruct", _reconstruct),
-            ("multiarray", "scalar", _scalar),
+            ("multiarray", "scalar", lambda kind, data: _from_buffer(data, kind, ())),
             ("numeric", "_frombuffer", _from_buffer),
         )
     },

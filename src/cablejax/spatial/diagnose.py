@@ -101,7 +101,9 @@ def diagnose_space(
     gap = gap_of(before[use], after[use], kept_windows, noise, smallest)
     equivalent = _equivalent(found, named)
     verdict = _verdict(gap, 1e3 * smallest, named, equivalent)
-    share = _share(verdict, gap, lambda: gap_of(before[use], found.unseen()[0][use], kept_windows, noise, smallest))
+    share = gap.shrinkage
+    if verdict == "unknown":  # each effect may be absent: by all of them together
+        share = gap_of(before[use], found.unseen()[0][use], kept_windows, noise, smallest).shrinkage
     if verdict in ("none", "unknown"):
         effects = ()
     offset = ParameterEstimate(constant_offset(after[use], kept_windows.windows), None, "m")
@@ -109,7 +111,7 @@ def diagnose_space(
     where = where_of(log, kept_windows.windows, nominal, before[use], noise, smallest, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, share), *changes[:1], *shifted]),
+        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, share or 0.0), *changes[:1], *shifted]),
         effects=effects,
         equivalent=equivalent,
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
@@ -131,11 +133,6 @@ def diagnose_space(
         settings={"edges": edges, "window_s": longest, **package_versions(("jax",)), "devices": jax.default_backend()},
         identified=found,
     )
-
-
-def _share(verdict: Verdict, gap: Gap, of_all_effects: Callable[[], Gap]) -> float:
-    """Share of the gap that goes away; where each effect may be absent, by all of them together."""
-    return max((of_all_effects() if verdict == "unknown" else gap).shrinkage or 0.0, 0.0)
 
 
 def _to_fit(log: GapLog) -> tuple[Windows, int]:
