@@ -1,8 +1,14 @@
-"""Damaged files."""
+"""Contents of folders, and damaged files."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
+
+
+def tree(path: Path) -> dict[str, bytes]:
+    """Content of every file under a folder, by its path there."""
+    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
 
 
 def with_other_bytes(whole: bytes, count: int) -> Iterator[bytes]:

@@ -36,6 +36,7 @@ from cablejax.dataset.windows import read_trajectories
 from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import MotionConfig, random_motion
+from file_cases import tree
 
 TINY = DatasetConfig(
     n_trajectories=8,
@@ -132,10 +133,6 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.motions import MotionConfig, random_motion
 config, path = eval(sys.argv[1]), sys.argv[2]
 """
-
-
-def tree(path: Path) -> dict[str, bytes]:
-    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
 
 
 def child(code: str, config: DatasetConfig, path: Path, *arguments: str, **environment: str) -> subprocess.Popen:

@@ -19,6 +19,7 @@ from cablejax.dataset.opening import open_or_create, open_store
 from cablejax.dataset.schema import Block, DatasetConfig, Randomisation, digest_of_config
 from cablejax.dataset.store import Store
 from cablejax.simulate.motions import MotionConfig
+from file_cases import tree
 
 SMALL = DatasetConfig(
     n_trajectories=7, n_steps=2, shard_size=3, discretisation=Discretisation(Cable(n_keypoints=4), n_links=5)
@@ -40,10 +41,6 @@ def complete(store: Store) -> list[int]:
     for shard in made:
         store.write_shard(shard, block(store.config, shard))
     return made
-
-
-def tree(path: Path) -> dict[str, bytes]:
-    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
 
 
 def chunk_files(path: Path, config: DatasetConfig) -> list[Path]:

@@ -11,6 +11,7 @@ from cablejax.diagnose import CableDiagnosis, DiagnosisError, diagnose
 from cablejax.diagnose.log_faults import clock_offset, early_keypoints, steadied
 from cablejax.diagnose.recording import prepare
 from cablejax.gaplog import GapLogError
+from cablejax.gaplog_join import chosen
 from cablejax.types import GapLog
 from diagnose_cases import BY_NAME, SAMPLES, clean, log_of, noise, record
 
@@ -30,11 +31,6 @@ def not_misled(result: CableDiagnosis, *true: str) -> bool:
 
 def caveat(result: CableDiagnosis, words: str) -> bool:
     return any(words in text for text in result.caveats)
-
-
-def episodes(log: GapLog, chosen: list[int]) -> GapLog:
-    arrays = {f.name: getattr(log, f.name)[chosen] for f in dataclasses.fields(GapLog) if f.name != "meta"}
-    return GapLog(meta={**log.meta, "motion": [log.meta["motion"][i] for i in chosen]}, **arrays)
 
 
 def samples(log: GapLog, chosen: np.ndarray) -> GapLog:
@@ -65,7 +61,7 @@ def holed(log: GapLog, share: float) -> GapLog:
     "effect", [pytest.param((OFFSET,), marks=pytest.mark.slow, id="effect"), pytest.param((), id="none")]
 )
 def test_one_episode_is_reported_as_a_limit(effect):
-    result = told(episodes(record(*effect), [0]))
+    result = told(chosen(record(*effect), [0]))
     assert caveat(result, "The log has one episode") and not_misled(result, NAME)
     assert (result.verdict == "none") == (effect == ())
 

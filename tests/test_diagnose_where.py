@@ -13,6 +13,7 @@ from cablejax.diagnose.regimes import largest_curvature
 from cablejax.diagnose.significance import LEVEL, contrast_p, variance_inflation
 from cablejax.diagnose.where import _bending, localise
 from cablejax.diagnose.where_words import describe
+from cablejax.types import GapLog
 from diagnose_cases import MOTIONS, SAMPLES, arches, log_of, poses
 
 NOISE = 1e-3
@@ -233,6 +234,6 @@ def test_bending_of_keypoints_that_are_not_evenly_spaced():
 def test_the_first_episode_alone_does_not_say_how_far_apart_samples_are():
     whitened = np.random.default_rng(0).normal(size=(2, 100, 9, 2))
     whitened[0, 1:] = np.nan
-    log = types.SimpleNamespace(time=np.tile(0.1 * np.arange(100), (2, 1)), episode_length=np.array([1, 100]))
-    hold = np.zeros((2, 100), bool)
-    assert variance_inflation(whitened, log, hold) == pytest.approx(6.0)  # pyright: ignore[reportArgumentType]
+    time, pose = np.tile(0.1 * np.arange(100), (2, 1)), np.zeros((2, 100, 2, 3))
+    log = GapLog(time, whitened, pose, pose, np.array([1, 100]), {})
+    assert variance_inflation(whitened, log, np.zeros((2, 100), bool)) == pytest.approx(6.0)
