@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from typing import Annotated, get_args
 
@@ -169,8 +170,6 @@ class BenchLoop(Command):
 
     def execute(self):
         """Times the batched closed loop and returns steps per second."""
-        import functools
-
         import numpy as np
 
         from cablejax.cable import Discretisation

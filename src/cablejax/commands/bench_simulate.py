@@ -7,6 +7,7 @@ import pathlib
 import time
 from typing import TYPE_CHECKING, Any
 
+from cablejax.commands.cable import find_cable
 from cablejax.commands.options import Command, say, text_table
 from cablejax.limits import require
 
@@ -48,7 +49,6 @@ class BenchSimulate(Command):
 
     def execute(self):
         """Times the engines in turns and returns microseconds, distances and transitions per second."""
-        from cablejax.commands.cable import find_cable
         from cablejax.commands.workloads import setting
         from cablejax.simulate import ENGINES
 

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
+from cablejax.commands.cable import find_cable
 from cablejax.commands.options import Command, UsageError, output_folder, text_table
+from cablejax.limits import require
 from cablejax.solver_names import SolverName
 
 if TYPE_CHECKING:
@@ -72,13 +74,11 @@ class Shape(Command):
 
     def execute(self):
         """Brings the cable to the targets, keeps each run as it ends, and reports."""
-        from cablejax.commands.cable import find_cable
         from cablejax.commands.results import table_of
         from cablejax.commands.resuming import unfinished
         from cablejax.commands.runs import Job, known_from, plant_of, shape_and_report, staged_effects
         from cablejax.control.shaping import METHODS, knowing, load_model
         from cablejax.control.targets import load_target, make_target
-        from cablejax.limits import require
         from cablejax.perceive.camera import CameraConfig
 
         if self.motion is not None and self.perception == "cloud":
@@ -131,7 +131,6 @@ class Shape(Command):
 
     def _play(self, path: pathlib.Path, effects: tuple[GivenEffect, ...]):
         """Plays a motion on the plant and writes the log of it."""
-        from cablejax.commands.cable import find_cable
         from cablejax.commands.runs import plant_of
         from cablejax.gaplog import read_gap_log, write_gap_log
         from cablejax.simulate.plant import Plant

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
+from cablejax.commands.cable import cable_of_verdict, check_verdicts, find_cable
 from cablejax.commands.options import Command, say
 from cablejax.whole_file import draft_folder, sole_writer
 
@@ -105,7 +106,6 @@ class Simulate(Command):
             ValueError: an option is out of its range, or a file that it names cannot be used.
         """
         from cablejax.cable import Cable
-        from cablejax.commands.cable import cable_of_verdict, check_verdicts, find_cable
         from cablejax.effects.given import parse_effect
         from cablejax.effects.verdicts import posterior_of_verdict
 

@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import tyro
 
+from cablejax.commands.cable import find_cable
 from cablejax.commands.options import Command, say
+from cablejax.limits import require
+from cablejax.text_file import read_json, write_json
 
 if TYPE_CHECKING:
     from cablejax.diagnose import Diagnosis
@@ -52,7 +55,6 @@ class Study(Command):
 
     def execute(self):
         """Records and diagnoses round by round, keeps each as it ends, and reports."""
-        from cablejax.commands.cable import find_cable
         from cablejax.commands.diagnose import diagnose_and_report
         from cablejax.commands.resuming import unfinished
         from cablejax.commands.runs import plant_of, staged_effects
@@ -63,12 +65,10 @@ class Study(Command):
         from cablejax.effects.verdicts import read_verdict_json
         from cablejax.gaplog import read_gap_log, write_gap_log
         from cablejax.gaplog_join import joined
-        from cablejax.limits import require
         from cablejax.report.sheet import write_sheet
         from cablejax.report.study_sheet import study_sheet
         from cablejax.simulate.plant import Plant
         from cablejax.simulate.play import play
-        from cablejax.text_file import write_json
 
         require(self.rounds, "count", "--rounds")
         require(self.noise_mm, "noise_mm", "--noise-mm")
@@ -131,7 +131,6 @@ def finished_rounds(state: pathlib.Path) -> int:
     from cablejax.diagnose.verdict_json import read_verdict
     from cablejax.effects.verdicts import read_verdict_json
     from cablejax.gaplog import read_gap_log
-    from cablejax.text_file import read_json
 
     out, number = state.parents[1], 0
     try:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from cablejax.commands.artefacts import PAGE, Kind, kind_of
+from cablejax.commands.export import read_log
 from cablejax.commands.options import Command, UsageError, output_file
 
 if TYPE_CHECKING:
@@ -91,6 +92,4 @@ def sheet_of(kind: Kind, path: pathlib.Path) -> Sheet:
         from cablejax.diagnose.verdict_json import read_verdict
 
         return made_sheets.verdict_sheet(read_verdict(path), str(path))
-    from cablejax.commands.export import read_log
-
     return log_sheet.log_sheet(read_log(kind, path), str(path), "" if kind == "log" else kind)
