@@ -8,6 +8,7 @@ import pytest
 
 from cablejax.cable import GRAVITY, Cable, Discretisation
 from cablejax.effects.given import GivenEffect, parse_effect
+from cablejax.simulate.composite import link_bodies
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig, plant_model
 
@@ -125,7 +126,7 @@ def test_bad_set_ups_are_refused():
 
 def test_weight_and_plugins():
     model = plant_model(CONFIG)
-    free = model.body_mass[[i for i in range(model.nbody) if model.body(i).name.startswith("cable")]][1:-1]
+    free = model.body_mass[link_bodies(model)][1:-1]
     np.testing.assert_allclose(free, CABLE.cable.linear_density * CABLE.link_length)
     assert model.nplugin == 0
 

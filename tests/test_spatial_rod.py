@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.compile import compiler_options
-from cablejax.simulate.composite import build_grasped_chain
+from cablejax.simulate.composite import build_grasped_chain, link_bodies
 from cablejax.simulate.rod import Rod, RodPhysics
 from cablejax.simulate.rod.material import forces_of_torques, spin_of_joints
 
@@ -50,7 +50,7 @@ def _mujoco(config, samples, sideways):
     model = build_grasped_chain(config)
     data = mujoco.MjData(model)
     mocap = [model.body_mocapid[mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"gripper_{k}")] for k in range(2)]
-    links = [i for i in range(model.nbody) if model.body(i).name.startswith("cable")]
+    links = link_bodies(model)
     substeps, points = round(_INTERVAL / config.timestep), []
     for sample in range(samples):
         for k in range(substeps if sample else 0):

@@ -127,6 +127,11 @@ def add_links(
     return links
 
 
+def link_bodies(model: mujoco.MjModel) -> np.ndarray:
+    """Indices of the bodies that are the cable's links, in order of arc length, shape [n]."""
+    return np.array([i for i in range(model.nbody) if model.body(i).name.startswith("cable")])
+
+
 def link_lengths(config: Discretisation) -> np.ndarray:
     """Length of each link [m], shape [n_links]: half-length links at the held ends."""
     lengths = np.full(config.n_links, config.link_length)

@@ -20,7 +20,7 @@ from cablejax.effects.base import Hook
 from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, normal_gravity
 from cablejax.simulate.compiled_steps import advance
-from cablejax.simulate.composite import build_grasped_chain, stable_damping_time
+from cablejax.simulate.composite import build_grasped_chain, link_bodies, stable_damping_time
 from cablejax.simulate.engine import Engine, finely_sampled
 from cablejax.simulate.friction import PATCH_EDGE, STRIBECK_SPEED, on_table
 from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
@@ -100,7 +100,7 @@ class _Simulation:
         self.data = mujoco.MjData(self.model)
         self.nominal_mass = self.model.body_mass.copy()
         self.nominal_inertia = self.model.body_inertia.copy()
-        self.links = np.array([i for i in range(self.model.nbody) if self.model.body(i).name.startswith("cable")])
+        self.links = link_bodies(self.model)
 
     def run(self, physics: Physics, state: CableState, twist, count: int, interval: float, keypoints, poses) -> None:
         """Simulates in place; writes samples into `keypoints` [T + 1, N, D] and `poses` [T + 1, Q, P]."""

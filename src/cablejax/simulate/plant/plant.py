@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import NEVER
-from cablejax.simulate.composite import node_offsets
+from cablejax.simulate.composite import link_bodies, node_offsets
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.plant.between_steps import Extension, Memory, TableFriction
 from cablejax.simulate.plant.config import PlantConfig
@@ -40,8 +40,7 @@ class Plant(TablePlant):
         self._take_on(config.physics)
         self.model = plant_model(config)
         self._data = mujoco.MjData(self.model)
-        names = (self.model.body(i).name for i in range(self.model.nbody))
-        self._links = np.array([i for i, name in enumerate(names) if name.startswith("cable")])
+        self._links = link_bodies(self.model)
         self._offsets = node_offsets(self.config.discretisation)[:, None]
         self._balls = self.model.jnt_qposadr[bending_joints(self.model)][:, None] + np.arange(4)
         # The mocap bodies coincide with the frames of what they hold: the last link begins before the grasped end.
