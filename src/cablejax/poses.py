@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 
 from cablejax.arrays import positions_at, quaternion_product, wrapped
 
@@ -24,6 +24,20 @@ _UNUSUAL = 8.0
 """A jump is so many times the usual step besides: all poses may be noisy."""
 _AWAY, _BACK = 5, 0.25
 """A misreading is back after so many samples at most, within this part of the jump."""
+
+
+def planar_rows(value: Float[ArrayLike, "2 3"], name: str) -> Float[np.ndarray, "2 3"]:
+    """Poses or twists of two grippers in the plane, in double precision, as a new array.
+
+    Raises:
+        ValueError: another shape, or not finite; calls them `name`.
+    """
+    array = np.array(value, dtype=float)
+    if array.shape != (2, 3):
+        raise ValueError(f"{name} has shape {array.shape}, expected (2, 3): one planar row for each of two grippers.")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} is not finite: {array.tolist()}. Check what produced it.")
+    return array
 
 
 def poses_from_markers(

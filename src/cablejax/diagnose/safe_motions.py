@@ -16,6 +16,7 @@ from scipy.special import j0
 from cablejax.arrays import wrapped
 from cablejax.cable import Discretisation
 from cablejax.diagnose.motion_bounds import FARTHEST, NEAREST, Bounds
+from cablejax.poses import planar_rows
 from cablejax.simulate.motions import MotionConfig, admissible
 
 INTERVAL = 0.1
@@ -143,9 +144,7 @@ def safe_ways(config: Discretisation, first: Float[np.ndarray, "2 3"], bounds: B
     Raises:
         ValueError: `first` is not two planar poses.
     """
-    first = np.asarray(first, np.float64)
-    if first.shape != (2, 3) or not np.isfinite(first).all():
-        raise ValueError(f"first has shape {first.shape}, expected two finite poses (x, y, theta).")
+    first = planar_rows(first, "first")
     length = config.cable.length
     start = _vector(first)
     low, high = (distance / length for distance in bounds.distances(length))

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from cablejax.limits import LIMITS
 from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState, judge, quality, track
 from cablejax.perceive.initial import cloud_path, first_fit, path_length
+from cablejax.poses import planar_rows
 
 # Lengths of the cable over which a cloud and the grippers can hardly extend.
 _FARTHEST = 4.0
@@ -84,7 +85,7 @@ class Tracker:
         Raises:
             ValueError: the cloud or the pose has a wrong shape, or the pose is not finite.
         """
-        pose = _checked_pose(gripper_pose)
+        pose = planar_rows(gripper_pose, "gripper_pose")
         cloud = padded(points, self.config.capacity)
         settings = self.config.registration
         turn = pose[1, 2] - pose[0, 2]
@@ -103,7 +104,7 @@ class Tracker:
         self, state: TrackState, points: Float[np.ndarray, "n D"], gripper_pose: Float[np.ndarray, "Q 3"]
     ) -> tuple[TrackState, Track]:
         """Processes the next cloud; arguments and errors as in `init`."""
-        pose = _checked_pose(gripper_pose)
+        pose = planar_rows(gripper_pose, "gripper_pose")
         cloud = padded(points, self.config.capacity)
         after, seen = track(self.config, state, jnp.asarray(cloud.points, float), cloud.mask, jnp.asarray(pose, float))
         misfits = int(after.misfits)
@@ -187,13 +188,3 @@ class Tracker:
             return state, otherwise
         nowhere = jnp.full((config.registration.n_keypoints, 2), jnp.nan)
         return state, Track(nowhere, status, state.lost, *found_by)
-
-
-def _checked_pose(value: Float[np.ndarray, "Q 3"]) -> np.ndarray:
-    pose = np.asarray(value, float)
-    if pose.shape != (2, 3) or not np.isfinite(pose).all():
-        raise ValueError(
-            f"gripper_pose is {pose.tolist()}, expected two finite rows (x, y, theta): without the grippers' poses, "
-            "the arc length of the points is unknown."
-        )
-    return pose

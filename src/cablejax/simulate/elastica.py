@@ -20,6 +20,7 @@ from jaxtyping import Float
 from scipy.integrate import cumulative_trapezoid, solve_bvp
 
 from cablejax.arrays import positions_at
+from cablejax.poses import planar_rows
 
 MESH = 61
 """Points of the initial collocation mesh."""
@@ -96,9 +97,7 @@ def solve_elastica(
     Raises:
         ElasticaError: the chord is not shorter than the rod, or no solution was found.
     """
-    pose = np.asarray(gripper_pose, float)
-    if pose.shape != (2, 3) or not np.isfinite(pose).all():
-        raise ValueError(f"gripper_pose has shape {pose.shape} or is not finite, expected 2 finite rows (x, y, theta).")
+    pose = planar_rows(gripper_pose, "gripper_pose")
     delta = pose[1, :2] - pose[0, :2]
     chord = float(np.hypot(*delta)) / length
     if chord >= 1.0:

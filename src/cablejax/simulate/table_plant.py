@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from cablejax.effects.camera import in_camera_frame
 from cablejax.effects.physics import Physics
+from cablejax.poses import planar_rows
 from cablejax.simulate.arms import Arms
 from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
 from cablejax.simulate.plant_config import ObservedConfig
@@ -108,7 +109,7 @@ class TablePlant(abc.ABC):
         """As `step`, with `samples` observations evenly spread over the interval, the last one at its end."""
         if self._steps_done is None:
             raise ValueError("The plant has no cable yet: call reset(gripper_pose) first.")
-        twist = checked("twist", twist)
+        twist = planar_rows(twist, "twist")
         steps = self.config.discretisation.steps_in(interval)
         if samples < 1 or steps % samples:
             raise ValueError(
@@ -185,7 +186,7 @@ class TablePlant(abc.ABC):
 
     def _checked_start(self, gripper_pose: np.ndarray) -> np.ndarray:
         """The pose to lay a cable out at, as `reset` takes it."""
-        pose = checked("gripper_pose", gripper_pose)
+        pose = planar_rows(gripper_pose, "gripper_pose")
         self._check_distance(pose, self._free_length(0.0))
         return pose
 
@@ -215,17 +216,3 @@ class TablePlant(abc.ABC):
                 f"The grippers would be {distance:.4g} m apart and pull the cable of {length:.4g} m taut: keep them "
                 f"within {TAUT * length:.4g} m."
             )
-
-
-def checked(name: str, value: np.ndarray) -> np.ndarray:
-    """A planar row for each gripper, float64, shape [2, 3].
-
-    Raises:
-        ValueError: another shape, or not finite.
-    """
-    array = np.array(value, dtype=float)
-    if array.shape != (2, 3):
-        raise ValueError(f"{name} has shape {array.shape}, expected (2, 3): one planar row for each of two grippers.")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} is not finite: {array.tolist()}. Check what produced it; the plant has not moved.")
-    return array
