@@ -17,7 +17,6 @@ from cablejax.report.style import (
     FIGURE_STYLE,
     LIGHT,
     METHOD_LABEL,
-    METHOD_ORDER,
     by_shape,
     cable_curve,
     common_window,
@@ -128,16 +127,15 @@ def _still(ax: Any, shape: str, runs: dict[Method, ClosedLoopRun], view: tuple[f
 def _moving(ax: Any, runs: dict[Method, ClosedLoopRun], time: float) -> list[Any]:
     """Draws the runs of a panel at one instant [s]; between samples the cable is interpolated."""
     artists: list[Any] = []
-    methods: list[Method] = [method for method in METHOD_ORDER if method in runs]
-    for method in methods:
-        run, colour = runs[method], LIGHT.method(method)
+    for method, run in runs.items():
+        colour = LIGHT.method(method)
         strong = method == "residual" or len(runs) == 1
         pose, keypoints = _at(run.times, run.gripper_pose, time), _at(run.times, run.keypoints, time)
         artists += draw_grippers(ax, pose, color=LIGHT.gripper if strong else _GHOST)
         artists += ax.plot(*cable_curve(keypoints, pose).T, color=colour, lw=2.2, solid_capstyle="round")
         artists += ax.plot(*keypoints.T, color=colour, ls="", marker="o", ms=3.4)
-    for row, method in enumerate(methods[::-1]):
-        error = float(_at(runs[method].times, runs[method].error_cm, time))
+    for row, (method, run) in enumerate(reversed(runs.items())):
+        error = float(_at(run.times, run.error_cm, time))
         place = {
             "xy": (0.2, 0.0),
             "xycoords": "axes fraction",

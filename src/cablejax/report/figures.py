@@ -6,7 +6,6 @@ state, no display needed. Notebooks show it, `page.svg` inlines it, `figure.save
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import matplotlib
@@ -59,12 +58,11 @@ def final_shapes(runs: Runs) -> Figure:
             _table_axes(ax, views[shape])
             target = next(iter(pair.values())).target.keypoints
             ax.plot(*cable_curve(target).T, color=LIGHT.target, lw=7, alpha=0.45, solid_capstyle="round")
-            for method in _present(pair):
-                run = pair[method]
+            for method, run in pair.items():
                 _draw_cable(ax, run, -1, method)
             ax.set_title(shape, fontsize=14)
-            for row, method in enumerate(reversed(_present(pair))):
-                words = f"{pair[method].terminal_error_cm:.2f} cm {METHOD_LABEL[method]}"
+            for row, (method, run) in enumerate(reversed(pair.items())):
+                words = f"{run.terminal_error_cm:.2f} cm {METHOD_LABEL[method]}"
                 ax.annotate(
                     words, (0.0, 0.0), xycoords="axes fraction", xytext=(0.0, -4.0 - 15.0 * row),
                     textcoords="offset points", color=LIGHT.method(method), va="top", fontsize=10.5,
@@ -83,8 +81,7 @@ def error_over_time(runs: Runs) -> Figure:
         low = min(goal, *(float(np.nanmin(r.error_cm)) for r in runs.values()))
         high = max(goal, *(float(np.nanmax(r.error_cm)) for r in runs.values()))
         for ax, pair in zip(axes, pairs.values(), strict=True):
-            for method in _present(pair):
-                run = pair[method]
+            for method, run in pair.items():
                 ax.plot(run.times, run.error_cm, color=LIGHT.method(method), lw=2.2, label=METHOD_LABEL[method])
                 if run.straightened.any():
                     ax.plot(run.times, np.where(run.straightened, run.error_cm, np.nan), **_DOTTED)
@@ -135,8 +132,7 @@ def motion_bound(runs: Runs) -> Figure:
     with matplotlib.rc_context(_STYLE):
         figure, axes = _row_of_panels(list(pairs), "motion bound [cm]")
         for ax, pair in zip(axes, pairs.values(), strict=True):
-            for method in _present(pair):
-                run = pair[method]
+            for method, run in pair.items():
                 ax.step(run.times, 100.0 * run.radius, where="post", color=LIGHT.method(method), lw=2.0)
             ax.set_ylim(bottom=0.0)
         _method_legend(figure, runs)
@@ -168,10 +164,6 @@ def snapshots(runs: Runs) -> Figure:
             ax.set_title(f"{run.times[index]:.0f} s   {run.error_cm[index]:.2f} cm", fontsize=10)
         draw_scale_bar(axes[-1], view)
     return figure
-
-
-def _present(pair: Mapping[Method, ClosedLoopRun]) -> list[Method]:
-    return [method for method in METHOD_ORDER if method in pair]
 
 
 def _table_axes(ax: Axes, view: tuple[float, float, float, float]) -> None:

@@ -161,7 +161,7 @@ def animation_data(runs: Runs) -> dict[str, Any]:
             {
                 "name": shape,
                 "target": integers(cable_curve(next(iter(pair.values())).target.keypoints, n_points=97)),
-                "runs": [course(method, pair[method]) for method in METHOD_ORDER if method in pair],
+                "runs": [course(method, run) for method, run in pair.items()],
             }
             for shape, pair in pairs.items()
         ],

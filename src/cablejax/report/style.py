@@ -27,17 +27,15 @@ METHOD_LABEL: dict[Method, str] = {
 
 
 def by_shape(runs: Runs) -> dict[str, dict[Method, ClosedLoopRun]]:
-    """The runs grouped as `{shape: {method: run}}`, in the order of their first appearance.
+    """The runs grouped as `{shape: {method: run}}`: shapes as they first appear, methods in drawing order.
 
     Raises:
         ValueError: there is no run.
     """
     if not runs:
         raise ValueError("A report needs at least one run, got none.")
-    grouped: dict[str, dict[Method, ClosedLoopRun]] = {}
-    for (shape, method), run in runs.items():
-        grouped.setdefault(shape, {})[method] = run
-    return grouped
+    shapes = dict.fromkeys(shape for shape, _ in runs)
+    return {shape: {one: runs[shape, one] for one in METHOD_ORDER if (shape, one) in runs} for shape in shapes}
 
 
 @dataclasses.dataclass(frozen=True)
