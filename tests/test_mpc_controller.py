@@ -460,6 +460,9 @@ def test_times_a_control_call():
         ({"shrink_below": 0.9}, "thresholds"),
         ({"min_reduction": 0.0}, "min_reduction"),
         ({"workspace": ((0.0, 1.0), (1.0, 0.0))}, "workspace"),
+        # a bound at infinity took the opposite one with it
+        ({"workspace": ((0.0, -1.0), (np.inf, 1.0))}, r"workspace .* each a number from -1000 to 1000 m"),
+        ({"workspace": ("ab", "cd")}, "workspace"),
         ({"max_change": 0.0}, "max_change"),
         ({"max_restarts": 1.5}, "max_restarts"),
         ({"restart_after": 2.5}, "restart_after"),

@@ -157,13 +157,15 @@ def check_workspace(settings: Any) -> None:
         return
     try:
         (left, bottom), (right, top) = settings.workspace
-        ordered = left < right and bottom < top
+        # beyond all places is infinity, of which a planner can take no difference
+        placed = all(value in LIMITS["place"] for value in (left, bottom, right, top))
+        ordered = placed and left < right and bottom < top
     except (TypeError, ValueError):
         ordered = False
     if not ordered:
         raise ValueError(
             f"{type(settings).__name__}.workspace is {settings.workspace}, expected ((x, y) of the lowest, "
-            "(x, y) of the highest corner) [m]."
+            f"(x, y) of the highest corner), each {LIMITS['place']}."
         )
 
 
