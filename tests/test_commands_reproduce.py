@@ -88,6 +88,13 @@ def test_the_cable_of_a_verdict_is_simulated_and_another_one_refused(tmp_path):
         known_from(load_model("gns-reference"), (), (path,))
 
 
+@pytest.mark.parametrize(("range_of", "field"), [("friction", "friction_coefficient"), ("damping", "damping_time")])
+def test_factors_of_a_value_of_zero_are_refused(tmp_path, range_of, field):
+    write_cable(tmp_path / "cable.toml", Cable(**{field: 0.0}))
+    with pytest.raises(ValueError, match=f"--{range_of}-range is given, but the cable has no {range_of}"):
+        Simulate(cable=tmp_path / "cable.toml", **{f"{range_of}_range": (0.5, 2.0)}).dataset_config()
+
+
 def test_what_is_named_beside_an_unknown_cause_is_added_with_a_warning(tmp_path, capsys):
     named = {"name": "bending_stiffness", "parameters": {"ratio": {"value": 1.5, "ci90": None, "unit": ""}}}
     verdict = {"schema": "cablejax-verdict/1", "verdict": "named+unknown", "effects": [named]}

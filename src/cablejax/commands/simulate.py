@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from cablejax.commands.cable import cable_of_verdict, check_verdicts, find_cable
-from cablejax.commands.options import Command, say
+from cablejax.commands.options import Command, UsageError, say
 from cablejax.whole_file import draft_folder, sole_writer
 
 if TYPE_CHECKING:
@@ -122,6 +122,12 @@ class Simulate(Command):
         else:
             cable = next(filter(None, map(cable_of_verdict, self.with_)), Cable())
         check_verdicts(self.with_, cable, "Leave --cable out to simulate the verdict's.")
+        for name, nominal in (("friction", cable.friction_coefficient), ("damping", cable.damping_time)):
+            if getattr(self, f"{name}_range") is not None and nominal == 0:
+                raise UsageError(
+                    f"--{name}-range is given, but the cable has no {name}, and factors of 0 are 0: leave it out, or "
+                    "give the cable some."
+                )
         config = self.config_of(cable, effects)
         return dataclasses.replace(config, posterior=together)
 
