@@ -5,9 +5,12 @@ import json
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable
 from cablejax.cli import main
 from cablejax.commands import runs
-from cablejax.gaplog import read_gap_log
+from cablejax.control.targets import straight_start
+from cablejax.diagnose.motion_file import commands_log
+from cablejax.gaplog import read_gap_log, write_gap_log
 from cli_cases import small_model
 
 SHAPE_KEYS = {
@@ -76,6 +79,16 @@ def test_results_are_not_overwritten_unasked(weights, tmp_path, capsys):
     assert (tmp_path / "summary.json").read_text() == "mine"
 
 
+def test_a_motion_that_is_played_leaves_no_page_of_an_earlier_run_next_to_its_log(tmp_path):
+    motion, out = tmp_path / "motion.npz", tmp_path / "run"
+    write_gap_log(motion, commands_log({"rest": np.repeat(straight_start(Cable())[None], 4, axis=0)}, 0.5, Cable()))
+    out.mkdir()
+    for name in ("report.html", "summary.json", "demo.gif", "notes.txt"):
+        (out / name).write_text("of another run")
+    assert main(["shape", "--motion", str(motion), "--links", "8", "--out", str(out), "--overwrite"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["log.npz", "notes.txt"]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -116,6 +129,7 @@ def test_demo_tells_its_story_in_a_table(weights, tmp_path, capsys):
     assert shown.out.startswith("shape") and "\nS " in shown.out and "report.html" in shown.out
     assert "with online residual" in shown.err and "without residual" in shown.err
     assert set(json.loads((out / "summary.json").read_text())["shapes"]) == {"S"}
+    assert "--shapes S --steps 1 --links 12" in (out / "report.html").read_text()
 
 
 @pytest.mark.slow

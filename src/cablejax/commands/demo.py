@@ -45,6 +45,7 @@ class Demo(Command):
 
     def execute(self):
         """Shapes U, S and Z with and without the residual, reports, and diagnoses the run."""
+        from cablejax.commands.reproduce import command_line
         from cablejax.commands.results import table_of
         from cablejax.commands.resuming import unfinished
         from cablejax.commands.runs import PLANT_EFFECT, Job, plant_of, shape_and_report, staged_effects
@@ -62,7 +63,7 @@ class Demo(Command):
             steps=self.steps,
         )
         facts = {
-            "command": f"cablejax demo --seed {self.seed} --steps {self.steps} --links {self.links}",
+            "command": command_line(self, "demo"),
             "model": self.weights,
             "solver": self.solver,
         }

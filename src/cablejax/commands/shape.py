@@ -146,6 +146,8 @@ class Shape(Command):
             noise=1e-3 * (self.noise_mm or 0.0),
             seed=self.seed,
         )
+        for old in ("report.html", "summary.json", "demo.gif"):  # of another run, whose log goes
+            (out / old).unlink(missing_ok=True)
         written = write_gap_log(out / "log.npz", log, overwrite=True)
         seconds = float(sum(log.time[e, n - 1] for e, n in enumerate(log.episode_length)))
         result = {"log": str(written), "episodes": len(log.episode_length), "seconds": seconds}
