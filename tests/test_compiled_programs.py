@@ -81,6 +81,11 @@ def test_a_folder_that_cannot_be_made_is_no_error(undecided, tmp_path):
     assert keep_compiled_programs() is None and "JAX_COMPILATION_CACHE_DIR" not in os.environ
 
 
+def test_a_user_without_a_home_is_no_error(undecided):
+    undecided.setenv(FOLDER, "~nobody_of_this_name/cache")
+    assert keep_compiled_programs() is None and "JAX_COMPILATION_CACHE_DIR" not in os.environ
+
+
 def test_numba_compiles_where_nothing_can_be_kept(monkeypatch):
     """As for a service without a home, and a package that another user installed."""
 

@@ -36,6 +36,8 @@ def test_named_arrays_come_back_and_others_are_not_looked_at(tmp_path):
         read_npz(tmp_path / "a.npz", ["objects"])
     with pytest.raises(FileNotFoundError, match="There is no file"):
         read_npz(tmp_path / "b.npz", ["a"])
+    with pytest.raises(NpzError, match="is a folder, expected an"):
+        read_npz(tmp_path, ["a"])
 
 
 @pytest.mark.parametrize("content", [b"", b"garbage", b"\x93NUMPY"])

@@ -29,16 +29,16 @@ def keep_compiled_programs() -> pathlib.Path | None:
 
     Returns:
         The folder; None where nothing is kept by this call: the user has decided, JAX has been imported and so belongs
-        to somebody else, or the folder cannot be written to.
+        to somebody else, or the folder cannot be written to or the user has no home.
     """
     chosen = os.environ.get(FOLDER)
     if chosen == "" or "jax" in sys.modules or "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return None
     base = pathlib.Path(chosen) if chosen else _user_cache() / "cablejax"
-    folder = base.expanduser().absolute() / f"programs-{_processor()}"
     try:
+        folder = base.expanduser().absolute() / f"programs-{_processor()}"
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home
         return None
     if not os.access(folder, os.W_OK):
         return None

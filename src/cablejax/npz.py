@@ -39,11 +39,13 @@ def read_npz(
         text: those of both that may hold text; all others hold real numbers or truth values.
 
     Raises:
-        NpzError: the file is no `.npz`, cannot be read, is too large when decompressed, lacks a required array, or
-            holds something else under one of these names.
+        NpzError: the file is a folder or no `.npz`, cannot be read, is too large when decompressed, lacks a required
+            array, or holds something else under one of these names.
         FileNotFoundError: there is no such file.
     """
     path = pathlib.Path(path)
+    if path.is_dir():
+        raise NpzError(f"{path} is a folder, expected an .npz file.")
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}.")
     if not zipfile.is_zipfile(path):
