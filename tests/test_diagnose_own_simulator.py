@@ -420,6 +420,7 @@ ALLOWED = {f"cablejax.diagnose.{name}" for name in GENERIC} | {
     "cablejax.arrays",
     "cablejax.bounded",
     "cablejax.effects.effect",
+    "cablejax.provenance",
 }
 
 
