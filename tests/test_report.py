@@ -48,10 +48,27 @@ def test_windows_hold_every_cable_and_share_one_scale():
         assert one.keypoints[..., 1].min() > y0 and one.keypoints[..., 1].max() < y1
 
 
+@pytest.mark.parametrize(("length", "bar"), [(0.2, [0.05, "5 cm"]), (1.0, [0.2, "20 cm"]), (6.0, [1.0, "1 m"])])
+def test_every_cable_is_drawn_alike(length, bar):
+    """Grippers and margins go by the cable's length, and so does the scale bar."""
+
+    def scaled(of):
+        target = dataclasses.replace(of.target, keypoints=length * of.target.keypoints)
+        pose = of.gripper_pose * [length, length, 1.0]
+        return dataclasses.replace(of, target=target, keypoints=length * of.keypoints, gripper_pose=pose)
+
+    reference = animation_data(demo_runs())
+    data = animation_data({key: scaled(one) for key, one in demo_runs().items()})
+    assert list(data["bar"]) == bar
+    np.testing.assert_allclose(data["gripper"], length * np.array(reference["gripper"]))
+    for shape, view in reference["view"].items():
+        np.testing.assert_allclose(data["view"][shape], length * np.array(view))
+
+
 @pytest.mark.parametrize("end", [0, 1])
 def test_gripper_stands_behind_the_end_that_it_holds(end):
     theta = 0.7
-    wrist = gripper_outline(np.array([0.2, -0.1, theta]), end)[-1].mean(axis=0) - [0.2, -0.1]
+    wrist = gripper_outline(np.array([0.2, -0.1, theta]), end, 1.0)[-1].mean(axis=0) - [0.2, -0.1]
     along = wrist @ [np.cos(theta), np.sin(theta)]
     assert np.sign(along) == (-1 if end == 0 else 1)
 

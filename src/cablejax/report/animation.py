@@ -22,6 +22,7 @@ from cablejax.report.style import (
     common_window,
     draw_grippers,
     draw_scale_bar,
+    drawn_size,
 )
 from cablejax.whole_file import whole_file
 
@@ -69,12 +70,12 @@ def write_gif(path: str | os.PathLike[str], runs: Runs, *, width: int = 960, fra
             _still(ax, shape, panel, views[shape])
         drawn = axes[-1].lines[:1]
         figure.legend(drawn, ["target"], loc="center left", bbox_to_anchor=(300 / width, top), labelcolor=LIGHT.muted)
-        draw_scale_bar(axes[-1], views[list(pairs)[-1]])
+        draw_scale_bar(axes[-1], views[list(pairs)[-1]], drawn_size(runs))
 
         def draw(time: float) -> list[Any]:
             clock.set_text(f"{time:.0f} s")
             panels = zip(axes, pairs.values(), strict=True)
-            return [artist for ax, panel in panels for artist in _moving(ax, panel, time)]
+            return [artist for ax, panel in panels for artist in _moving(ax, panel, time, drawn_size(runs))]
 
         animate(path, figure, draw, instants, frames_per_second=frames_per_second, hold_s=_HOLD_S)
 
@@ -124,14 +125,14 @@ def _still(ax: Any, shape: str, runs: dict[Method, ClosedLoopRun], view: tuple[f
     ax.plot(*target.T, color=LIGHT.target, lw=2.2, ls=(0, (2.4, 1.7)))
 
 
-def _moving(ax: Any, runs: dict[Method, ClosedLoopRun], time: float) -> list[Any]:
+def _moving(ax: Any, runs: dict[Method, ClosedLoopRun], time: float, length: float) -> list[Any]:
     """Draws the runs of a panel at one instant [s]; between samples the cable is interpolated."""
     artists: list[Any] = []
     for method, run in runs.items():
         colour = LIGHT.method(method)
         strong = method == "residual" or len(runs) == 1
         pose, keypoints = _at(run.times, run.gripper_pose, time), _at(run.times, run.keypoints, time)
-        artists += draw_grippers(ax, pose, color=LIGHT.gripper if strong else _GHOST)
+        artists += draw_grippers(ax, pose, length, color=LIGHT.gripper if strong else _GHOST)
         artists += ax.plot(*cable_curve(keypoints, pose).T, color=colour, lw=2.2, solid_capstyle="round")
         artists += ax.plot(*keypoints.T, color=colour, ls="", marker="o", ms=3.4)
     for row, (method, run) in enumerate(reversed(runs.items())):

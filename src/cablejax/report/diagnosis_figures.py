@@ -17,7 +17,7 @@ from cablejax.arrays import stretches
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
 from cablejax.diagnose.judgement import effect_title
 from cablejax.report.effect_words import explained_label
-from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, draw_grippers
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, bar_of, cable_curve, draw_grippers
 
 # Transparent where there is no gap, so that it reads on a light and on a dark page.
 _HEAT = LinearSegmentedColormap.from_list(
@@ -51,7 +51,10 @@ def cable_figure(diagnosis: CableDiagnosis) -> Figure:
     nominal = diagnosis.nominal[episode, sample]
     explained = None if diagnosis.explained is None else diagnosis.explained[episode, sample]
     drawn = [p for p in (observed, nominal, explained) if p is not None]
-    low, high = np.nanmin(np.concatenate(drawn), axis=0) - 0.09, np.nanmax(np.concatenate(drawn), axis=0) + 0.09
+    arclength = np.asarray(log.meta["keypoint_arclength_m"])
+    length = float(arclength[-1] - arclength[0])
+    every, margin = np.concatenate(drawn), 0.09 * length
+    low, high = np.nanmin(every, axis=0) - margin, np.nanmax(every, axis=0) + margin
     width, height = high - low
     distance = np.where(np.isfinite(observed), observed - nominal, 0.0)
     furthest = int(np.argmax(np.linalg.norm(distance, axis=-1)))
@@ -75,19 +78,18 @@ def cable_figure(diagnosis: CableDiagnosis) -> Figure:
             axes.set(aspect="equal", xticks=[], yticks=[])
             axes.spines[:].set_visible(axes is zoom)
             _draw_places(axes, diagnosis, nominal if explained is None else explained)
-            draw_grippers(axes, pose, alpha=0.8)
+            draw_grippers(axes, pose, length, alpha=0.8)
             if explained is not None:
                 label = explained_label(diagnosis)
                 axes.plot(*cable_curve(explained).T, color=LIGHT.residual, lw=3.2 * thick, label=label)
             believed, dashes = "nominal simulator", (0, (4, 2))
             axes.plot(*cable_curve(nominal).T, color=LIGHT.direct, lw=2.0 * thick, ls=dashes, label=believed)
             axes.plot(*observed.T, "o", color=LIGHT.ink, ms=4.5 * thick, label="observed keypoints")
-        _bar(ax, 0.1, "10 cm")
+        _bar(ax, 0.1 * length)
         if zoom is not None:
             zoom.set_title("enlarged", fontsize=10)
             ax.add_patch(Rectangle(tuple(middle - reach), 2 * reach, 2 * reach, fill=False, ec=LIGHT.muted, lw=1))
-            size = 10.0 ** np.floor(np.log10(reach))
-            _bar(zoom, size, f"{1e3 * size:g} mm")
+            _bar(zoom, 0.5 * reach)
         handles, labels = ax.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower left", ncols=len(labels))
     return figure
@@ -224,8 +226,10 @@ def _sections(effect: NamedEffect, arclength: np.ndarray) -> list[tuple[float, f
     return [] if along is None else [(float(along[0]), float(along[1]))]
 
 
-def _bar(ax: Axes, length: float, label: str) -> None:
+def _bar(ax: Axes, about: float) -> None:
+    """A scale bar of about this length [m]."""
+    bar, label = bar_of(about)
     (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
     x, y = x1 - 0.04 * (x1 - x0), y0 + 0.05 * (y1 - y0)
-    ax.plot([x - length, x], [y, y], color=LIGHT.muted, lw=1.8, solid_capstyle="butt")
+    ax.plot([x - bar, x], [y, y], color=LIGHT.muted, lw=1.8, solid_capstyle="butt")
     ax.text(x, y + 0.02 * (y1 - y0), label, ha="right", va="bottom", color=LIGHT.muted, fontsize=9)

@@ -24,6 +24,7 @@ from cablejax.report.style import (
     common_window,
     draw_grippers,
     draw_scale_bar,
+    drawn_size,
 )
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def final_shapes(runs: Runs) -> Figure:
             target = next(iter(pair.values())).target.keypoints
             ax.plot(*cable_curve(target).T, color=LIGHT.target, lw=7, alpha=0.45, solid_capstyle="round")
             for method, run in pair.items():
-                _draw_cable(ax, run, -1, method)
+                _draw_cable(ax, run, -1, method, drawn_size(runs))
             ax.set_title(shape, fontsize=14)
             for row, (method, run) in enumerate(reversed(pair.items())):
                 words = f"{run.terminal_error_cm:.2f} cm {METHOD_LABEL[method]}"
@@ -67,7 +68,7 @@ def final_shapes(runs: Runs) -> Figure:
                     words, (0.0, 0.0), xycoords="axes fraction", xytext=(0.0, -4.0 - 15.0 * row),
                     textcoords="offset points", color=LIGHT.method(method), va="top", fontsize=10.5,
                 )  # fmt: skip
-        draw_scale_bar(axes[-1], views[next(reversed(views))])
+        draw_scale_bar(axes[-1], views[next(reversed(views))], drawn_size(runs))
         _method_legend(figure, runs, Line2D([], [], color=LIGHT.target, lw=7, alpha=0.45, label="target"))
     return figure
 
@@ -151,7 +152,8 @@ def snapshots(runs: Runs) -> Figure:
     run = pair["residual"]
     last = len(run.times) - 1
     chosen = np.unique(np.round(last * np.linspace(0.0, 1.0, 5) ** 1.6).astype(int))
-    view = common_window({(shape, "residual"): run})[shape]
+    only: Runs = {(shape, "residual"): run}
+    view, length = common_window(only)[shape], drawn_size(only)
     width = 2.3
     with matplotlib.rc_context(_STYLE):
         height = width * (view[3] - view[2]) / (view[1] - view[0])
@@ -160,9 +162,9 @@ def snapshots(runs: Runs) -> Figure:
         for ax, index in zip(axes, chosen, strict=True):
             _table_axes(ax, view)
             ax.plot(*cable_curve(run.target.keypoints).T, color=LIGHT.target, lw=1.6, ls=(0, (4, 3)))
-            _draw_cable(ax, run, int(index), "residual")
+            _draw_cable(ax, run, int(index), "residual", length)
             ax.set_title(f"{run.times[index]:.0f} s   {run.error_cm[index]:.2f} cm", fontsize=10)
-        draw_scale_bar(axes[-1], view)
+        draw_scale_bar(axes[-1], view, length)
     return figure
 
 
@@ -171,9 +173,9 @@ def _table_axes(ax: Axes, view: tuple[float, float, float, float]) -> None:
     ax.axis("off")
 
 
-def _draw_cable(ax: Axes, run: ClosedLoopRun, index: int, method: Method) -> None:
+def _draw_cable(ax: Axes, run: ClosedLoopRun, index: int, method: Method, length: float) -> None:
     colour = LIGHT.method(method)
-    draw_grippers(ax, run.gripper_pose[index], alpha=0.85 if method == "residual" else 0.3)
+    draw_grippers(ax, run.gripper_pose[index], length, alpha=0.85 if method == "residual" else 0.3)
     ax.plot(*cable_curve(run.keypoints[index], run.gripper_pose[index]).T, color=colour, lw=2.2)
     ax.plot(*run.keypoints[index].T, "o", color=colour, ms=3.0)
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from cablejax.control.targets import length_through
 from cablejax.diagnose.diagnosis import NextMotion
 from cablejax.diagnose.judgement import effect_title
 from cablejax.report.animation import DPI, animate
@@ -18,6 +19,7 @@ from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, draw_grip
 
 _COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")
 _MOMENTS = 5
+# [lengths of the cable]
 _MARGIN = 0.1
 _SPEED, _FRAMES_PER_SECOND, _HOLD_S = 5.0, 10.0, 1.5
 _WIDTH, _HEADER, _LINE = 640, 40, 20
@@ -40,7 +42,7 @@ def motion_figure(following: NextMotion | None) -> Figure | None:
 
 def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> None:
     """Writes a preview of the motion, five times as fast."""
-    low, high = _window(following)
+    (low, high), length = _window(following), _length(following)
     names, width = list(following.shapes), _WIDTH / DPI
     header = (_HEADER + _LINE * len(names)) / DPI
     height = header + max(width * (high[1] - low[1]) / (high[0] - low[0]), 0.01)
@@ -57,7 +59,7 @@ def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> Non
 
         def draw(sample: int) -> list[Any]:
             clock.set_text(f"{following.interval * sample:.0f} s")
-            artists = draw_grippers(ax, following.poses[sample])
+            artists = draw_grippers(ax, following.poses[sample], length)
             for name, colour in zip(names, _COLOURS, strict=False):
                 artists += ax.plot(*cable_curve(following.shapes[name][sample]).T, color=colour, lw=1.8)
             return artists
@@ -67,11 +69,11 @@ def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> Non
 
 
 def _film(figure: Any, following: NextMotion) -> None:
-    moments, (low, high) = telling_moments(following), _window(following)
+    moments, (low, high), length = telling_moments(following), _window(following), _length(following)
     for ax, sample in zip(figure.subplots(1, len(moments), squeeze=False)[0], moments, strict=True):
         for gripper in range(2):
             ax.plot(*following.poses[:, gripper, :2].T, color=LIGHT.faint, lw=1.5)
-        draw_grippers(ax, following.poses[sample], alpha=0.85)
+        draw_grippers(ax, following.poses[sample], length, alpha=0.85)
         for (name, points), colour in zip(following.shapes.items(), _COLOURS, strict=False):
             ax.plot(*cable_curve(points[sample]).T, color=colour, lw=1.8, label=explanation_title(name))
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
@@ -120,4 +122,10 @@ def _window(following: NextMotion) -> tuple[Float[np.ndarray, "2"], Float[np.nda
     every = np.concatenate(
         [following.poses[..., :2].reshape(-1, 2), *(p.reshape(-1, 2) for p in following.shapes.values())]
     )
-    return np.nanmin(every, axis=0) - _MARGIN, np.nanmax(every, axis=0) + _MARGIN
+    margin = _MARGIN * _length(following)
+    return np.nanmin(every, axis=0) - margin, np.nanmax(every, axis=0) + margin
+
+
+def _length(following: NextMotion) -> float:
+    """Of the cable [m], to two digits."""
+    return float(f"{length_through(next(iter(following.shapes.values()))[0]):.2g}")

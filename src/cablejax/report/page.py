@@ -21,9 +21,11 @@ from cablejax.report.html import json_script, svg, write_html
 from cablejax.report.style import (
     METHOD_LABEL,
     METHOD_ORDER,
+    bar_of,
     by_shape,
     cable_curve,
     common_window,
+    drawn_size,
     gripper_outline,
 )
 
@@ -152,11 +154,12 @@ def animation_data(runs: Runs) -> dict[str, Any]:
             "curve": [integers(cable_curve(x, g, 49)) for x, g in zip(run.keypoints, run.gripper_pose, strict=True)],
         }
 
-    pairs = by_shape(runs)
+    pairs, length = by_shape(runs), drawn_size(runs)
     return {
         "end": max(float(r.times[-1]) for r in runs.values()),
         "view": common_window(runs, margin=0.1),
-        "gripper": [[polygon.tolist() for polygon in gripper_outline(np.zeros(3), end)] for end in range(2)],
+        "gripper": [[polygon.tolist() for polygon in gripper_outline(np.zeros(3), end, length)] for end in range(2)],
+        "bar": bar_of(0.2 * length),
         "shapes": [
             {
                 "name": shape,

@@ -109,6 +109,11 @@ def cable_curve(
     return CubicSpline(distance, points, bc_type=ends)(np.linspace(0.0, distance[-1], n_points))
 
 
+def drawn_size(runs: Runs) -> float:
+    """Length of the longest cable of the runs [m], to two digits: what grippers, margins and scale bars go by."""
+    return float(f"{max(run.target.length for run in runs.values()):.2g}")
+
+
 def common_window(
     runs: Runs, margin: float = 0.12, *, final_only: bool = False
 ) -> dict[str, tuple[float, float, float, float]]:
@@ -116,7 +121,7 @@ def common_window(
 
     Args:
         runs: the runs.
-        margin: free space around the cable, where the grippers' bodies are drawn [m].
+        margin: free space around the cable, where the grippers' bodies are drawn [lengths of the cable].
         final_only: whether only the last sample has to be in view.
     """
     boxes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -127,7 +132,7 @@ def common_window(
         if shape in boxes:
             low, high = np.minimum(low, boxes[shape][0]), np.maximum(high, boxes[shape][1])
         boxes[shape] = low, high
-    width, height = np.max([high - low for low, high in boxes.values()], axis=0) + 2 * margin
+    width, height = np.max([high - low for low, high in boxes.values()], axis=0) + 2 * margin * drawn_size(runs)
     half = 0.5 * np.array([width, height])
     views = {}
     for shape, (low, high) in boxes.items():
@@ -137,12 +142,13 @@ def common_window(
     return views
 
 
-def gripper_outline(pose: Float[np.ndarray, "3"], end: int) -> list[Float[np.ndarray, "K 2"]]:
+def gripper_outline(pose: Float[np.ndarray, "3"], end: int, length: float) -> list[Float[np.ndarray, "K 2"]]:
     """Polygons [m] of a parallel-jaw gripper seen from above: two jaws along the cable, a palm and a wrist behind them.
 
     Args:
         pose: (x, y, theta), theta the direction of the cable's tangent.
         end: 0 where the cable leaves the gripper along theta, 1 where it comes in along theta.
+        length: of the cable [m]; a gripper is drawn about a tenth as long.
     """
     x, y, theta = np.asarray(pose, dtype=float)
     back = -1.0 if end == 0 else 1.0
@@ -151,7 +157,7 @@ def gripper_outline(pose: Float[np.ndarray, "3"], end: int) -> list[Float[np.nda
     def box(along: tuple[float, float], across: tuple[float, float]) -> np.ndarray:
         corners = [(along[0], across[0]), (along[1], across[0]), (along[1], across[1]), (along[0], across[1])]
         local = np.array([(back * a, c) for a, c in corners])
-        return local @ rotation.T + [x, y]
+        return length * local @ rotation.T + [x, y]
 
     return [
         box((-0.022, 0.030), (0.008, 0.020)),
@@ -161,14 +167,23 @@ def gripper_outline(pose: Float[np.ndarray, "3"], end: int) -> list[Float[np.nda
     ]
 
 
-def draw_grippers(ax: Any, pose: Float[np.ndarray, "2 3"], **look: Any) -> list[Any]:
-    """Draws both grippers at their poses [m, rad] and returns the patches."""
-    outlines = [polygon for end in range(2) for polygon in gripper_outline(pose[end], end)]
+def draw_grippers(ax: Any, pose: Float[np.ndarray, "2 3"], length: float, **look: Any) -> list[Any]:
+    """Draws both grippers of a cable of this length at their poses [m, rad] and returns the patches."""
+    outlines = [polygon for end in range(2) for polygon in gripper_outline(pose[end], end, length)]
     return [patch for polygon in outlines for patch in ax.fill(*polygon.T, lw=0, **{"color": LIGHT.gripper, **look})]
 
 
-def draw_scale_bar(ax: Any, view: tuple[float, float, float, float]) -> None:
-    """A bar of 20 cm in the lower right corner of a view [m]."""
-    x, y = view[1] - 0.02, view[2] + 0.02
-    ax.plot([x - 0.2, x], [y, y], color=LIGHT.muted, lw=1.5, solid_capstyle="butt")
-    ax.text(x - 0.1, y + 0.012, "20 cm", ha="center", va="bottom", color=LIGHT.muted, fontsize=9)
+def bar_of(length: float) -> tuple[float, str]:
+    """Length [m] and label of a scale bar: of 1, 2 and 5 times powers of ten, the one that is nearest to `length`."""
+    bars = (digit * 10.0**power for power in range(-6, 4) for digit in (1, 2, 5))
+    bar = min(bars, key=lambda bar: abs(np.log(bar / length)))
+    factor, unit = (1.0, "m") if bar >= 1.0 else (100.0, "cm") if bar >= 0.01 else (1000.0, "mm")
+    return bar, f"{factor * bar:g} {unit}"
+
+
+def draw_scale_bar(ax: Any, view: tuple[float, float, float, float], length: float) -> None:
+    """A bar of about a fifth of the cable's length in the lower right corner of a view [m]."""
+    bar, label = bar_of(0.2 * length)
+    x, y = view[1] - 0.02 * length, view[2] + 0.02 * length
+    ax.plot([x - bar, x], [y, y], color=LIGHT.muted, lw=1.5, solid_capstyle="butt")
+    ax.text(x - bar / 2, y + 0.012 * length, label, ha="center", va="bottom", color=LIGHT.muted, fontsize=9)

@@ -96,10 +96,11 @@
     pen.textAlign = "center";
     pen.font = "12px system-ui, sans-serif";
     pen.beginPath();
-    pen.moveTo(width - 4 - 0.2 * scale, height - 6);
+    const [bar, label] = data.bar;
+    pen.moveTo(width - 4 - bar * scale, height - 6);
     pen.lineTo(width - 4, height - 6);
     pen.stroke();
-    pen.fillText("20 cm", width - 4 - 0.1 * scale, height - 11);
+    pen.fillText(label, width - 4 - (bar / 2) * scale, height - 11);
   }
 
   const panels = data.shapes.map((shape) => {
