@@ -57,6 +57,54 @@ def test_it_follows_gymnasiums_rules():
         check_env(env.unwrapped)
 
 
+def test_other_libraries_make_it_with_pictures_and_without_a_warning():
+    """As `make_vec_env` of Stable-Baselines3 does."""
+    env = gymnasium.make(ENVIRONMENT, config=clean(), render_mode="rgb_array")
+    with pytest.raises(ResetNeeded):
+        env.unwrapped.render()
+    env.reset(seed=0, options={"target": "U"})
+    before = env.render()
+    for _ in range(4):
+        env.step(np.full((2, 3), 1.0))
+    after = env.render()
+    assert before.shape == after.shape == (480, 480, 3) and before.dtype == np.uint8
+    assert 0.001 < (before != after).any(axis=-1).mean() < 0.1
+    many = gymnasium.make_vec(ENVIRONMENT, 2, config=clean(), render_mode="rgb_array")
+    many.reset(seed=0, options={"target": "U"})
+    np.testing.assert_array_equal(many.render()[1], before)
+
+
+def test_without_a_render_mode_nothing_is_drawn():
+    env = ShapeCableEnv(CONFIG)
+    env.reset()
+    with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
+        assert env.render() is None
+
+
+def test_the_length_of_an_episode_is_the_configurations():
+    """Gymnasium's own time limit would be the same for every configuration."""
+    env = gymnasium.make(ENVIRONMENT, config=CONFIG)
+    assert env.spec.max_episode_steps is None and env.unwrapped.config.steps == CONFIG.steps
+
+
+def test_what_of_an_action_was_executed_is_reported():
+    config, turn = clean(steps=30), np.zeros((2, 3), np.float32)
+    turn[:, 2] = 1.0, -1.0
+    env, many = ShapeCableEnv(config), ShapeCableVectorEnv(2, config)
+    assert not env.reset(seed=0)[1]["executed_action"].any()
+    many.reset(seed=0)
+    executed = []
+    for _ in range(25):
+        before = env.cables.gripper_pose[0].copy()
+        executed.append(env.step(turn)[-1]["executed_action"])
+        moved = env.cables.gripper_pose[0] - before
+        np.testing.assert_allclose(executed[-1], moved / config.scale, atol=1e-5)
+        both = many.step(np.stack([turn, 0.1 * turn]))[-1]["executed_action"]
+        np.testing.assert_allclose(both[0], executed[-1], atol=1e-5)
+    np.testing.assert_allclose(executed[0], turn, atol=0.01)
+    assert not executed[-1].any()
+
+
 def test_an_episode_ends_in_time_or_at_the_target():
     env = ShapeCableEnv(CONFIG)
     env.reset(seed=1)

@@ -28,6 +28,8 @@ class Cables:
         target: wanted keypoints [m], float32, shape [B, N, 2].
         error: root mean square distance of the true keypoints to the target [lengths of the cable], shape [B].
         taken: actions in this episode, shape [B].
+        executed: the last action after its limits, in the same units, see `step`; 0 where it was not executed and after
+            a reset, float32, shape [B, 2, 3].
         names: of the targets.
     """
 
@@ -48,6 +50,7 @@ class Cables:
         self.keypoints, self.target = np.zeros((2, size, points, 2), np.float32)
         self.gripper_pose = rows(np.asarray(pose, np.float32)[None])
         self.error, self.taken = np.zeros(size), np.zeros(size, int)
+        self.executed = np.zeros((size, 2, 3), np.float32)
         self.names = [""] * size
 
     def _at_rest(self, physics: Physics, start: CableState) -> Float[np.ndarray, "2 N 2"]:
@@ -103,7 +106,7 @@ class Cables:
         jax.tree.map(lambda whole, leaf: put(whole, leaf[0]), self._state, self._start)
         self.target[row], self.names[row] = chosen.keypoints, chosen.name
         self.gripper_pose[row] = np.asarray(self._start.gripper_pose[0])
-        self.taken[row] = 0
+        self.taken[row], self.executed[row] = 0, 0.0
         only = np.arange(len(self.taken)) == row
         true, seen = np.repeat(shown[:, None], len(only), axis=1)
         self._observe(only, true, seen, [random] * len(only))
@@ -139,6 +142,7 @@ class Cables:
             lambda new, old: np.where(torn.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, self._state
         )
         self.taken += active
+        self.executed = np.where(torn[:, None, None], 0.0, twists / config.scale).astype(np.float32)
         seen = active & ~diverged & ~torn
         self.gripper_pose[seen] = poses[seen]
         self._observe(seen, keypoints, np.asarray(shown.keypoints[:, -1]), randoms)

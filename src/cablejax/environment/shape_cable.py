@@ -16,17 +16,23 @@ from gymnasium.vector.utils import batch_space
 
 from cablejax.environment.cables import Cables
 from cablejax.environment.config import ShapeCableConfig, require_config
+from cablejax.environment.picture import picture
 from cablejax.limits import require
 
 OBSERVED = ("keypoints", "gripper_pose", "target")
 """Parts of an observation."""
 
+_METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}
+
 
 def _spaces(config: ShapeCableConfig, render_mode: str | None) -> tuple[gymnasium.spaces.Dict, gymnasium.spaces.Box]:
-    """What is observed, and the actions; raises ValueError for a render mode, or what is no configuration."""
+    """What is observed, and the actions; raises ValueError for another render mode, or what is no configuration."""
     require_config(config)
-    if render_mode is not None:
-        raise ValueError(f"render_mode is {render_mode!r}, expected None: look at runs with `cablejax.report`.")
+    if render_mode not in (None, *_METADATA["render_modes"]):
+        raise ValueError(
+            f"render_mode is {render_mode!r}, expected None or 'rgb_array'. To open a window, wrap the environment in "
+            "`gymnasium.wrappers.HumanRendering`."
+        )
     points, length = config.cable.n_keypoints, config.cable.length
     turns = 2 * np.pi + config.steps * config.turn_rate * config.interval
     pose = np.repeat(np.array([[3 * length, 3 * length, turns]], np.float32), 2, axis=0)
@@ -50,17 +56,28 @@ def _require_reset(cables: Cables) -> None:
         raise gymnasium.error.ResetNeeded("There is no cable yet: call `reset` before `step`.")
 
 
+def _pictures(env: gymnasium.Env | gymnasium.vector.VectorEnv, cables: Cables) -> list[np.ndarray]:
+    """A picture of each cable; none, and a warning, where the environment was made without a render mode."""
+    if env.render_mode is None:
+        gymnasium.logger.warn("`render` draws nothing without a render mode: make it with render_mode='rgb_array'.")
+        return []
+    _require_reset(cables)
+    parts = zip(cables.keypoints, cables.gripper_pose, cables.target, strict=True)
+    return [picture(*part, 1.5 * cables.config.cable.length) for part in parts]
+
+
 class ShapeCableEnv(gymnasium.Env):
     """`cablejax/ShapeCable-v0`: bring a cable on a table to a shape by moving both of its ends.
 
-    `info` has "error" [lengths of the cable] and "target_name". `reset` takes the options "target" and "effects".
+    `info` has "error" [lengths of the cable], "executed_action", what of the last action was executed (see
+    `Cables.executed`), and "target_name". `reset` takes the options "target" and "effects".
 
     Args:
         config: see `ShapeCableConfig`.
-        render_mode: None; look at runs with `cablejax.report`.
+        render_mode: None, or "rgb_array" for `render`.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012, as Gymnasium has it
+    metadata = _METADATA
     """Gymnasium's description of the environment."""
 
     def __init__(self, config: ShapeCableConfig = ShapeCableConfig(), render_mode: str | None = None):
@@ -84,11 +101,20 @@ class ShapeCableEnv(gymnasium.Env):
         rewards, terminated, truncated = self.cables.step(np.asarray(action)[None], [self.np_random], np.array([True]))
         return self._observation(), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), self._info()
 
+    def render(self) -> np.ndarray | None:
+        """The table from above as an image, shape [480, 480, 3]; None without a render mode."""
+        return next(iter(_pictures(self, self.cables)), None)
+
     def _observation(self) -> dict[str, np.ndarray]:
         return {name: getattr(self.cables, name)[0].copy() for name in OBSERVED}
 
     def _info(self) -> dict[str, Any]:
-        return {"error": float(self.cables.error[0]), "target_name": self.cables.names[0]}
+        cables = self.cables
+        return {
+            "error": float(cables.error[0]),
+            "executed_action": cables.executed[0].copy(),
+            "target_name": cables.names[0],
+        }
 
 
 class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
@@ -97,10 +123,10 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
     Args:
         num_envs: cables side by side.
         config: see `ShapeCableConfig`.
-        render_mode: None.
+        render_mode: None, or "rgb_array" for `render`.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata = _METADATA | {"autoreset_mode": AutoresetMode.NEXT_STEP}
     """Gymnasium's description of the environment."""
 
     def __init__(self, num_envs: int, config: ShapeCableConfig = ShapeCableConfig(), render_mode: str | None = None):
@@ -144,8 +170,17 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
         self._ended = terminated | truncated
         return self._observation(), rewards, terminated, truncated, self._info()
 
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """An image of each environment's table, as of `ShapeCableEnv`; None without a render mode."""
+        return tuple(_pictures(self, self.cables)) or None
+
     def _observation(self) -> dict[str, np.ndarray]:
         return {name: getattr(self.cables, name).copy() for name in OBSERVED}
 
     def _info(self) -> dict[str, Any]:
-        return {"error": self.cables.error.copy(), "target_name": np.array(self.cables.names)}
+        cables = self.cables
+        return {
+            "error": cables.error.copy(),
+            "executed_action": cables.executed.copy(),
+            "target_name": np.array(cables.names),
+        }

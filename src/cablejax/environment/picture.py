@@ -1,0 +1,45 @@
+"""Pictures of an environment's cable, its grippers and its target, as Gymnasium's `render` returns them."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from cablejax.report.style import FIGURE_STYLE, LIGHT, cable_curve, draw_grippers
+
+PIXELS = 480
+"""Width and height of a picture."""
+_DPI = 100
+_MARGIN = 0.08
+"""Space for a gripper's body beyond its pose [m]."""
+
+
+def picture(
+    keypoints: Float[np.ndarray, "N 2"],
+    gripper_pose: Float[np.ndarray, "2 3"],
+    target: Float[np.ndarray, "N 2"],
+    half_width: float,
+) -> UInt8[np.ndarray, "480 480 3"]:
+    """Draws the table from above, the target dashed.
+
+    Args:
+        keypoints: observed [m].
+        gripper_pose: (x, y, theta) [m, rad].
+        target: wanted keypoints [m].
+        half_width: largest coordinate of a gripper [m]; the origin is in the middle.
+    """
+    half = half_width + _MARGIN
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(PIXELS / _DPI, PIXELS / _DPI), dpi=_DPI)
+        ax = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(-half, half), ylim=(-half, half))
+        ax.set_axis_off()
+        ax.plot(*cable_curve(target).T, color=LIGHT.target, lw=2.2, ls=(0, (2.4, 1.7)))
+        draw_grippers(ax, gripper_pose)
+        ax.plot(*cable_curve(keypoints).T, color=LIGHT.residual, lw=2.2, solid_capstyle="round")
+        ax.plot(*keypoints.T, color=LIGHT.residual, ls="", marker="o", ms=3.4)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
