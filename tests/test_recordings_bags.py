@@ -207,8 +207,65 @@ def test_messages_that_change_their_size_are_reported(tmp_path):
             message = ARRAY(header(float(t)), [pose_of(np.eye(7)[3])] * count)
             bag.write(connection, 10**9 * t, STORE.serialize_cdr(message, ARRAY.__msgtype__))
     text = LAYOUT.replace('grippers = ["/left/pose", "/right/pose"]', "")
-    with pytest.raises(ValueError, match="have 8 to 9 poses, expected the same number"):
+    with pytest.raises(
+        ValueError, match="message 2 on /cable/keypoints, has 8 poses, and the first 9, expected the same"
+    ):
         import_mcap(tmp_path / "bag", layout(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("order", "message"),
+    [
+        (np.arange(60)[::-1], r"message 1 on /cable/keypoints: the time is 1000\.58 s after 1000\.59 s"),
+        (
+            np.arange(60).reshape(2, 30).T.ravel(),
+            r"message 2 on /cable/keypoints: the time is 1000\.01 s after 1000\.3 s",
+        ),
+        (np.repeat(np.arange(30), 2), r"message 1 on /cable/keypoints: the time is 1000 s after 1000 s"),
+    ],
+    ids=["reversed", "two halves", "twice"],
+)
+@pytest.mark.parametrize("topic", ["/cable/keypoints", "/left/pose"])
+def test_times_that_run_backwards_are_refused(tmp_path, monkeypatch, order, message, topic):
+    """Sorted, they would show a motion that never was."""
+    points, stamps = swinging(60), np.tile(np.arange(60), (3, 1))
+    stamps[["/cable/keypoints", "/left/pose"].index(topic)] = order
+    times = iter((1000.0 + DT * stamps).ravel())
+    monkeypatch.setattr(sys.modules[__name__], "header", lambda time, original=header: original(next(times)))
+    bag = write_bag(tmp_path / "bag", points, grippers_of(points, stride=1), StoragePlugin.MCAP)
+    with pytest.raises(ValueError, match=message.replace("/cable/keypoints", topic) + ", expected increasing times"):
+        import_mcap(bag, layout(tmp_path))
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_bag_that_was_cut_off_can_be_mended(tmp_path, storage):
+    bag = write_bag(tmp_path / "bag", swinging(60), {}, storage)
+    file = next(path for path in bag.iterdir() if path.suffix in (".mcap", ".db3"))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(
+        ValueError, match=r"bag could not be read as a bag: .* If it was cut off, copy it again, or mend"
+    ):
+        import_mcap(bag, layout(tmp_path))
+
+
+def test_a_quaternion_that_is_none_is_reported_with_its_message(tmp_path):
+    points = swinging(60)
+    grippers = grippers_of(points)
+    grippers["/right/pose"][1][7, 3:] = 0.0
+    bag = write_bag(tmp_path / "bag", points, grippers, StoragePlugin.MCAP)
+    with pytest.raises(
+        ValueError, match=r"bag, message 7 on /right/pose: the quaternion of a gripper has the length 0"
+    ):
+        import_mcap(bag, layout(tmp_path))
+
+
+def test_a_missing_layout_is_answered_with_the_smallest_which_works(tmp_path):
+    bag = write_bag(tmp_path / "bag", 1000 * swinging(60), {}, StoragePlugin.MCAP)
+    with pytest.raises(ValueError, match="There is no file") as refused:
+        import_mcap(bag, tmp_path / "layout.toml")
+    text = str(refused.value)
+    log, _ = import_mcap(bag, layout(tmp_path, text[text.index("[cable]") :]))
+    assert log.keypoints.shape == (1, 60, 9, 3)
 
 
 def test_a_bag_that_is_too_large_is_refused_before_it_is_read(tmp_path, monkeypatch):

@@ -38,6 +38,11 @@ def test_pickles_become_a_log(folder, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["logs"][0]["episodes"] == 2
 
 
+def test_one_is_not_many(folder, tmp_path, capsys):
+    assert main(["import", "deform", str(folder / "train" / "1.pkl"), "--out", str(tmp_path / "log.npz")]) == 0
+    assert ": 1 episode, 200 samples of 9 keypoints in space" in capsys.readouterr().out
+
+
 def test_repairs_are_reported(folder, tmp_path, capsys):
     points = swinging(seed=1, phase=1)
     points[60:130] = points[60:130][:, [0, 1, 2, 4, 3, 5, 6, 7, 8]]

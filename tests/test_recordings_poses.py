@@ -207,7 +207,7 @@ def test_units_are_recognised_by_the_length_of_the_cable():
 
 
 def test_a_take_of_wrong_shape_is_refused():
-    with pytest.raises(ValueError, match=r"times do not increase \(sample 2"):
+    with pytest.raises(ValueError, match=r"sample 2: the time is 0\.1 s after 0\.1 s, expected increasing times"):
         Take("a", np.array([0.0, 0.1, 0.1]), np.zeros((3, 5, 3)))
     with pytest.raises(ValueError, match=r"keypoints has shape \(3, 5\)"):
         Take("a", np.arange(3.0), np.zeros((3, 5)))

@@ -228,7 +228,7 @@ def test_a_gripper_not_seen_for_a_moment_is_filled_in():
     parts, repairs = cut_at_gaps((take(points),), HELD)
     assert (
         samples_of(parts) == [("a", 200)]
-        and "3 samples without one of the gripper poses were interpolated" in repairs[0]
+        and "3 samples without one of the gripper poses: interpolated linearly" in repairs[0]
     )
     assert np.linalg.norm(parts[0].keypoints - right, axis=-1).max() < 2e-3
 

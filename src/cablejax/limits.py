@@ -169,6 +169,11 @@ def check_workspace(settings: Any) -> None:
         )
 
 
+def counted(count: int, noun: str) -> str:
+    """A number of things in words: "1 sample", "2 samples"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def shown(value: object) -> str:
     """A value for a message, shortened where it is long."""
     if isinstance(value, int) and abs(value) >= 10**20:

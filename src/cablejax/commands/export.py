@@ -10,6 +10,7 @@ import tyro
 
 from cablejax.commands.artefacts import Kind, kind_of
 from cablejax.commands.options import Command, UsageError, output_file
+from cablejax.limits import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,7 +60,7 @@ class Export(Command):
             write_rerun(out, log, simulated=simulated, about=about)
         samples = int(log.episode_length.sum())
         result = {"out": str(out), "episodes": len(log.episode_length), "samples": samples, "simulated": [*simulated]}
-        return result, f"{out}: {len(log.episode_length)} episodes, {samples} samples."
+        return result, f"{out}: {counted(len(log.episode_length), 'episode')}, {counted(samples, 'sample')}."
 
 
 def recorded(source: pathlib.Path) -> tuple[GapLog, dict[str, np.ndarray], str]:

@@ -12,6 +12,7 @@ import tyro
 from tyro.conf import subcommand
 
 from cablejax.commands.options import Command, UsageError, output_file
+from cablejax.limits import counted
 
 if TYPE_CHECKING:
     from cablejax.types import GapLog
@@ -76,7 +77,7 @@ class Csv(_Import):
     """Import a csv file of your own, one row per sample; a small TOML file names its columns and units.
 
     Attributes:
-        layout: The TOML file; docs/how_to/own_recording.md has an example.
+        layout: The TOML file; without one, the smallest is printed.
     """
 
     layout: pathlib.Path = pathlib.Path("layout.toml")
@@ -95,7 +96,7 @@ class Mcap(_Import):
     A log that `cablejax export mcap` wrote needs no TOML file.
 
     Attributes:
-        layout: The TOML file; docs/how_to/own_recording.md has an example.
+        layout: The TOML file; without one, the smallest is printed.
     """
 
     layout: pathlib.Path = pathlib.Path("layout.toml")
@@ -156,7 +157,8 @@ def _summary(path: pathlib.Path, log: GapLog, repairs: Sequence[str]) -> dict[st
 
 def _as_text(result: dict[str, Any]) -> str:
     lines = [
-        f"{result['log']}: {result['episodes']} episodes, {result['samples']} samples of {result['keypoints']} "
+        f"{result['log']}: {counted(result['episodes'], 'episode')}, {counted(result['samples'], 'sample')} of "
+        f"{result['keypoints']} "
         f"keypoints in {'space' if result['dimension'] == 3 else 'the plane'}, {100 * result['observed']:.4g} % of "
         f"them observed; the cable is {result['length_m']:.4g} m long.",
         *result["repairs"],

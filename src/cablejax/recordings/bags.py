@@ -7,18 +7,19 @@ from __future__ import annotations
 
 import os
 import pathlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from cablejax.extras import from_extra
-from cablejax.limits import require
+from cablejax.limits import counted, require
 from cablejax.poses import poses_at, without_misreadings
 from cablejax.recordings.layout import Fields, Layout, read_layout
 from cablejax.recordings.mcap_log import MAGIC
 from cablejax.recordings.table import unit_quaternions
-from cablejax.recordings.take import Take
+from cablejax.recordings.take import Take, require_increasing
 from cablejax.types import GapLog
 
 POSE_ARRAY, POSE_STAMPED = "geometry_msgs/msg/PoseArray", "geometry_msgs/msg/PoseStamped"
@@ -26,6 +27,12 @@ POSE_ARRAY, POSE_STAMPED = "geometry_msgs/msg/PoseArray", "geometry_msgs/msg/Pos
 
 SLOWEST = 0.075
 """Time between a gripper's poses [s] from which on too little is known of its motion in between."""
+
+
+_MEND = (
+    "If it was cut off, copy it again, or mend it with `mcap recover CUT.mcap -o WHOLE.mcap`, with `sqlite3 CUT.db3 "
+    "'.recover' | sqlite3 WHOLE.db3`, or, where metadata.yaml is missing or damaged, with `ros2 bag reindex FOLDER`."
+)
 
 
 class BagError(ValueError):
@@ -64,14 +71,15 @@ def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
     fields.nothing_left()
     wanted = {keypoints_topic: POSE_ARRAY, **{topic: POSE_STAMPED for topic in gripper_topics or []}}
     messages, frames = _messages(path, wanted)
-    time, rows = _sorted(messages[keypoints_topic])
-    count = {len(row) for row in rows}
-    if len(count) > 1:
+    time, rows = _in_order(path, keypoints_topic, messages)
+    count = [len(row) for row in rows]
+    if len(set(count)) > 1:
+        other = next(row for row, poses in enumerate(count) if poses != count[0])
         raise ValueError(
-            f"{path}: the messages on {keypoints_topic} have {min(count)} to {max(count)} poses, expected the same "
-            "number in each, NaN where a keypoint was not observed."
+            f"{path}, message {other} on {keypoints_topic}, has {counted(count[other], 'pose')}, and the first "
+            f"{count[0]}, expected the same number in each, NaN where a keypoint was not observed."
         )
-    if count == {0}:
+    if not count[0]:
         raise ValueError(f"{path}: the messages on {keypoints_topic} have no poses, expected one for each keypoint.")
     poses, misread = None, []
     if len(frames) > 1:
@@ -81,7 +89,7 @@ def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
     if gripper_topics is not None:
         tracks = []
         for topic in gripper_topics:
-            stamps, gripper_rows = _sorted(messages[topic])
+            stamps, gripper_rows = _in_order(path, topic, messages)
             if stamps[0] > time[-1] or stamps[-1] < time[0]:
                 raise ValueError(
                     f"{path}: {topic} has time stamps from {stamps[0]:.3f} to {stamps[-1]:.3f} s and {keypoints_topic} "
@@ -93,7 +101,8 @@ def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
                     f"{path}: the poses on {topic} are {apart:.3g} s apart, expected {SLOWEST:g} s at most, since the "
                     "gripper's motion in between is unknown. Record them at a higher rate."
                 )
-            track, jumps = without_misreadings(stamps, unit_quaternions(np.array(gripper_rows), f"{path}: {topic}"))
+            quaternions = unit_quaternions(np.array(gripper_rows), _place(path, topic))
+            track, jumps = without_misreadings(stamps, quaternions)
             misread += [f"{topic} {words}" for words in jumps.values()]
             tracks.append(_at(time, stamps, track[:, 0]))
         poses = np.stack(tracks, axis=1)
@@ -124,10 +133,11 @@ def _messages(path: pathlib.Path, wanted: dict[str, str]) -> tuple[dict[str, lis
     except BagError:
         raise
     except Exception as error:  # on a damaged file rosbags raises what its parts raise
-        raise BagError(f"{path} could not be read as a bag: {error}") from error
+        said = next(iter(str(error).splitlines()), type(error).__name__).rstrip(".")
+        raise BagError(f"{path} could not be read as a bag: {said}. {_MEND}") from error
     for topic, messages in found.items():
         if len(messages) < 2:
-            raise ValueError(f"{path} has {len(messages)} messages on {topic}, expected at least two.")
+            raise ValueError(f"{path} has {counted(len(messages), 'message')} on {topic}, expected at least two.")
         if len({stamp for stamp, _ in messages}) == 1:
             raise ValueError(
                 f"{path}: all messages on {topic} are stamped {messages[0][0]:g} s, expected the time of each in its "
@@ -167,9 +177,22 @@ def _numbers(pose: Any) -> list[float]:
     return [p.x, p.y, p.z, q.w, q.x, q.y, q.z]
 
 
-def _sorted(messages: list[tuple[float, np.ndarray]]) -> tuple[np.ndarray, list[np.ndarray]]:
-    ordered = sorted(messages, key=lambda message: message[0])
-    return np.array([time for time, _ in ordered]), [poses for _, poses in ordered]
+def _in_order(
+    path: pathlib.Path, topic: str, messages: dict[str, list[tuple[float, np.ndarray]]]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Times [s] and poses of a topic; raises ValueError where the times do not increase from message to message."""
+    time = np.array([stamp for stamp, _ in messages[topic]])
+    advice = (
+        "Either two nodes publish on the topic, or messages were recorded twice, or a clock was set back: sorted by "
+        "time they may show a motion that never was. Keep the messages of one node, in the order of their headers."
+    )
+    require_increasing(time, _place(path, topic), advice)
+    return time, [poses for _, poses in messages[topic]]
+
+
+def _place(path: pathlib.Path, topic: str) -> Callable[[int], str]:
+    """Says where a message is, counted from 0 in the order of recording."""
+    return lambda row: f"{path}, message {row} on {topic}"
 
 
 def _at(time: np.ndarray, stamps: np.ndarray, poses: Float[np.ndarray, "S 7"]) -> Float[np.ndarray, "T 7"]:

@@ -238,7 +238,7 @@ def require_readable(takes: tuple[Take, ...]) -> None:
             raise ValueError(
                 f"The x axes of grippers 0 and 1 are {one:.0f} and {other:.0f} degrees off the cable next to them "
                 f"(median), and {better:.0f} and {well:.0f} if {name}: expected qw, qx, qy, qz of a gripper whose x "
-                "axis is along the cable. Correct the order of the columns."
+                "axis is along the cable. Correct the order of their numbers."
             )
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from cablejax.arrays import positions_at, stretches
 from cablejax.cable_length import coordinate_noise
+from cablejax.limits import counted
 from cablejax.log_geometry import MOVED, gripper_motion
 from cablejax.poses import poses_at, without_misreadings
 from cablejax.recordings.take import Take, median_step, spacing
@@ -63,8 +64,8 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
         take, filled = _filled(take, on_grippers)
         if filled:
             reports.append(
-                f"Take {take.name}: {filled} samples without one of the gripper poses were interpolated linearly: none "
-                f"of these gaps is longer than {_fillable(take):.2g} s."
+                f"Take {take.name}: {counted(filled, 'sample')} without one of the gripper poses: interpolated "
+                f"linearly. None of these gaps is longer than {_fillable(take):.2g} s."
             )
         known = _known(take, on_grippers)
         breaks, reasons = _breaks(take)
@@ -79,13 +80,13 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
         kept = [(a, b) for a, b in long_enough if take.time[b - 1] - take.time[a] >= SHORTEST]
         if not known.all():
             reports.append(
-                f"Take {take.name}: in {int((~known).sum())} samples one of the gripper poses is missing for more than "
-                f"{_fillable(take):.2g} s; they were left out."
+                f"Take {take.name}: in {counted(int((~known).sum()), 'sample')} one of the gripper poses is missing "
+                f"for more than {_fillable(take):.2g} s: left out."
             )
         if lost := sum(b - a for a, b in spans) - sum(b - a for a, b in kept):
             reports.append(
-                f"Take {take.name}: {lost} samples in stretches shorter than {SHORTEST:g} s or {SHORTEST_SAMPLES} "
-                "samples were left out."
+                f"Take {take.name}: {counted(lost, 'sample')} in stretches shorter than {SHORTEST:g} s or "
+                f"{SHORTEST_SAMPLES} samples: left out."
             )
         # what was cut is still one recording
         take = dataclasses.replace(take, labels={"recording": take.name, **take.labels})

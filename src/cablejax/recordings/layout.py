@@ -20,6 +20,19 @@ from cablejax.recordings.take import Take
 from cablejax.text_file import read_toml
 from cablejax.types import GapLog
 
+_ANY = """[cable]
+diameter_m = 0.006
+linear_density_kg_per_m = 0.04
+bending_stiffness_n_m2 = 6e-4
+[frame]
+unit = "mm"
+"""
+SMALLEST = {
+    "columns": _ANY + '[columns]\ntime = "t"\nkeypoint = ["m{i}_x", "m{i}_y", "m{i}_z"]\ncount = 9\n',
+    "topics": _ANY + '[topics]\nkeypoints = "/cable/keypoints"\n',
+}
+"""The smallest layout of a csv and of a bag, with two keypoints on each gripper."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
@@ -117,7 +130,7 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
     try:
         values = read_toml(path)
     except (ValueError, OSError) as error:
-        raise ValueError(f"This is not a layout: {error} docs/how_to/own_recording.md has one.") from None
+        raise ValueError(f"This is not a layout: {error} The smallest is\n{SMALLEST[place]}") from None
     if unknown := set(values) - {"cable", "table", "frame", "source", place}:
         raise ValueError(
             f"{path} has the unknown tables {shown(sorted(unknown))}, expected [cable], [table], [frame], [source] "

@@ -98,7 +98,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     if all(len(own) > 1 and np.array_equal(own[1:], own[:-1], equal_nan=True) for own in points):
         raise ValueError(
             "All samples have the same keypoints to the last digit, which no tracker measures: expected a recording of "
-            "a cable that moves. Check the columns, and that the tracker ran."
+            "a cable that moves. Check which columns or topic are read, and that the tracker ran."
         )
     takes, outliers = without_outliers(takes)
     takes, flattened = tuple(into_frame(take, setup.frame) for take in takes), []

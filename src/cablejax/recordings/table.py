@@ -9,12 +9,13 @@ import itertools
 import math
 import os
 import pathlib
+from collections.abc import Callable
 
 import numpy as np
 
-from cablejax.limits import require, shown
+from cablejax.limits import counted, require, shown
 from cablejax.recordings.layout import Fields, Layout, read_layout
-from cablejax.recordings.take import Take
+from cablejax.recordings.take import Take, require_increasing
 from cablejax.text_file import read_text
 from cablejax.types import GapLog
 
@@ -39,6 +40,10 @@ class _Table:
     path: pathlib.Path
     columns: dict[str, list[str]]
     lines: list[int]
+
+    def place(self, row: int) -> str:
+        """Where a row is, for messages."""
+        return f"{self.path}, line {self.lines[row]}"
 
 
 def import_csv(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> tuple[GapLog, list[str]]:
@@ -68,8 +73,8 @@ def _takes(path: pathlib.Path, how: Layout) -> tuple[tuple[Take, ...], list[str]
         raise ValueError(f"{how.path}: [columns] time_unit is {time_unit!r}, expected one of {', '.join(SECONDS)}.")
     time = _numbers(table, [fields.take("time", str, "the name of a column")])[:, 0] * SECONDS[time_unit]
     if np.isnan(time).any():
-        line = table.lines[int(np.isnan(time).argmax())]
-        raise ValueError(f"{path}, line {line}: the time is empty, expected one for each row.")
+        empty = int(np.isnan(time).argmax())
+        raise ValueError(f"{table.place(empty)}: the time is empty, expected one for each row.")
     keypoints, unread = _keypoints(table, fields)
     pose = _poses(table, fields, keypoints.shape[2])
     episode = fields.take("episode", str, "the name of a column", None)
@@ -85,6 +90,7 @@ def _takes(path: pathlib.Path, how: Layout) -> tuple[tuple[Take, ...], list[str]
             raise ValueError(
                 f"{path}: episode {episodes[a]!r} has one row only (line {table.lines[a]}), expected at least two."
             )
+        require_increasing(time[a:b], lambda row, begin=a: table.place(begin + row))
         takes.append(
             Take(
                 name=episodes[a],
@@ -105,7 +111,7 @@ def _read(path: pathlib.Path) -> _Table:
     except (csv.Error, FileNotFoundError) as error:
         raise ValueError(f"{path} could not be read as csv: {error}") from None
     if len(rows) < 3:
-        raise ValueError(f"{path} has {len(rows)} rows, expected a header and at least two samples.")
+        raise ValueError(f"{path} has {counted(len(rows), 'row')}, expected a header and at least two samples.")
     header = [name.strip() for name in rows[0][1]]
     for delimiter, name in _OTHER_DELIMITERS.items():
         if len(header) == 1 and delimiter in header[0]:
@@ -140,8 +146,7 @@ def _numbers(table: _Table, names: list[str]) -> np.ndarray:
                 # Python reads 1_0 as ten
                 values[row, place] = np.nan if cell.lower() in _EMPTY else float(cell.replace("_", "?"))
             except ValueError:
-                where = f"{table.path}, line {table.lines[row]}"
-                raise ValueError(f"{where}: column {shown(name)} is {shown(cell)}, no number.") from None
+                raise ValueError(f"{table.place(row)}: column {shown(name)} is {shown(cell)}, no number.") from None
     return values
 
 
@@ -180,11 +185,15 @@ def _poses(table: _Table, fields: Fields, dimension: int) -> np.ndarray | None:
     if dimension == 2:
         pose[..., 2] *= _ANGLES[unit]
         return pose
-    return unit_quaternions(pose, str(table.path))
+    return unit_quaternions(pose, table.place)
 
 
-def unit_quaternions(pose: np.ndarray, where: str) -> np.ndarray:
+def unit_quaternions(pose: np.ndarray, place: Callable[[int], str]) -> np.ndarray:
     """Poses with quaternions of exactly unit length.
+
+    Args:
+        pose: (x, y, z, qw, qx, qy, qz), shape [T, Q, 7].
+        place: says where a sample is, for the message.
 
     Raises:
         ValueError: one is far from it, so that it is no quaternion.
@@ -194,7 +203,7 @@ def unit_quaternions(pose: np.ndarray, where: str) -> np.ndarray:
         sample = int(np.argmax(np.nan_to_num(np.abs(norm - 1)).max(axis=(1, 2))))
         length = float(norm[sample].ravel()[np.nan_to_num(np.abs(norm[sample] - 1)).argmax()])
         raise ValueError(
-            f"{where}: sample {sample} has a gripper quaternion of length {length:.3g}, "
-            "expected 1: check the columns of qw, qx, qy and qz."
+            f"{place(sample)}: the quaternion of a gripper has the length {length:.3g}, expected 1. Check what is "
+            "given as qw, qx, qy and qz."
         )
     return np.concatenate([pose[..., :3], pose[..., 3:] / norm], axis=-1)

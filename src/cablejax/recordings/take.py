@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -37,15 +37,12 @@ class Take:
             raise ValueError(
                 f"Take {self.name}: keypoints has shape {self.keypoints.shape}, expected ({samples}, N, 2 or 3)."
             )
-        if not np.isfinite(self.time).all() or (np.diff(self.time) <= 0).any():
-            row = int(np.argmax(~(np.diff(self.time) > 0))) + 1
-            raise ValueError(
-                f"Take {self.name}: its times do not increase (sample {row}: {self.time[row]:.17g} after "
-                f"{self.time[row - 1]:.17g}): sort the samples and remove duplicates."
-            )
+        require_increasing(self.time, lambda row: f"Take {self.name}, sample {row}")
         for name, values in (("keypoints", self.keypoints), ("gripper_pose", self.gripper_pose)):
-            largest = 0.0 if values is None else float(np.nanmax(np.abs(values), initial=0.0))
-            require(largest, "reading", f"Take {self.name}: the largest entry of {name}", "Not observed is NaN.")
+            sizes = np.zeros(1) if values is None else np.nanmax(np.abs(values), axis=(1, 2), initial=0.0)
+            row = int(np.argmax(sizes))
+            where = f"Take {self.name}, sample {row}: the largest entry of {name}"
+            require(float(sizes[row]), "reading", where, "Not observed is NaN.")
         shape = (samples, 2, 3 if self.keypoints.shape[2] == 2 else 7)
         if self.gripper_pose is not None and self.gripper_pose.shape != shape:
             raise ValueError(
@@ -59,6 +56,29 @@ class Take:
         return dataclasses.replace(
             self, name=name, time=self.time[begin:end], keypoints=self.keypoints[begin:end], gripper_pose=pose
         )
+
+
+def require_increasing(
+    time: Float[np.ndarray, " T"],
+    place: Callable[[int], str],
+    advice: str = "Sort the samples and remove those that are there twice.",
+) -> None:
+    """Rejects times that are not finite or do not increase.
+
+    Args:
+        time: of each sample [s].
+        place: says where a sample is, for the message.
+        advice: what to do, a sentence.
+
+    Raises:
+        ValueError: names the first such sample.
+    """
+    wrong = ~np.isfinite(time)
+    wrong[1:] |= ~(np.diff(time) > 0)
+    if wrong.any():
+        row = int(wrong.argmax())
+        before = f" after {time[row - 1]:.15g} s" if row else ""
+        raise ValueError(f"{place(row)}: the time is {time[row]:.15g} s{before}, expected increasing times. {advice}")
 
 
 def spacing(keypoints: Float[np.ndarray, "*B N D"]) -> Float[np.ndarray, "*B M"]:

@@ -47,5 +47,9 @@ def require_metres(length: float, unit: str) -> None:
     raise ValueError(
         f"Along its keypoints, read in {unit}, the cable measures {length:.4g} m, expected {PLAUSIBLE[0]:g} to "
         f"{PLAUSIBLE[1]:g}. "
-        + (f"It would be {' or '.join(better)}: name the unit." if better else "Check the unit and the columns.")
+        + (
+            f"It would be {' or '.join(better)}: name the unit."
+            if better
+            else "Check the unit, and which columns or topic are read."
+        )
     )

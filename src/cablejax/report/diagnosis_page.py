@@ -14,6 +14,7 @@ from cablejax.diagnose.judgement import FAINT, effect_title, in_its_place, liste
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.effects import OUTSIDE
 from cablejax.gaplog import SIMULATED, write_gap_log
+from cablejax.limits import counted
 from cablejax.report import diagnosis_sections as sections
 from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import cable_figure, where_figure
@@ -158,7 +159,7 @@ def _lead(diagnosis: CableDiagnosis) -> str:
     seconds = sum(float(t[n - 1] - t[0]) for t, n in zip(log.time, log.episode_length, strict=True))
     episodes = len(log.episode_length)
     return (
-        f"{episodes} episode{'' if episodes == 1 else 's'}, {seconds:.0f} s, {log.keypoints.shape[2]} keypoints. "
+        f"{counted(episodes, 'episode')}, {seconds:.0f} s, {log.keypoints.shape[2]} keypoints. "
         f"The simulator misses the recorded cable by {millimetres(gap.before_rmse_mm)}; the recording's own "
         f"{_noise(diagnosis)}."
     )

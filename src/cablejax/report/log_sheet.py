@@ -16,6 +16,7 @@ from cablejax.control.run import shape_error_cm
 from cablejax.diagnose.noise import noise_floor
 from cablejax.gaplog import Episode, episodes_of, targets_of
 from cablejax.gaplog_check import META_FIELDS
+from cablejax.limits import counted
 from cablejax.report.effect_words import millimetres
 from cablejax.report.sheet import Sheet, cable_cards, cable_facts, span
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve
@@ -41,7 +42,7 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
     ranges = ", ".join(f"{axis} {span(points[..., k])}" for k, axis in enumerate("xyz"[: points.shape[-1]]))
     return Sheet(
         kind="gap log",
-        title=f"{len(episodes)} episode{'s' if len(episodes) > 1 else ''} of a cable of {cable.length:g} m "
+        title=f"{counted(len(episodes), 'episode')} of a cable of {cable.length:g} m "
         f"{'on a table' if planar else 'in space'}, {seconds:.0f} s in all",
         lead=f"{name}: {log.meta['source']}",
         cards=[
