@@ -117,6 +117,13 @@ def test_the_cable_is_found_in_files_and_logs(cable, tmp_path):
         assert find_cable(tmp_path / name) == cable, name
 
 
+def test_the_cable_of_an_old_verdict_is_that_of_its_log(tmp_path):
+    """Verdicts did not state their cable before."""
+    (tmp_path / "verdict.json").write_text('{"schema": "cablejax-verdict/1", "verdict": "none"}')
+    write_gap_log(tmp_path / "log.npz", gap_log_from_episodes([at_rest(OTHER)], OTHER, source="test"))
+    assert find_cable(tmp_path) == OTHER
+
+
 def test_the_cable_is_found_in_stores_and_weights(tmp_path):
     chain = dataclasses.replace(DatasetConfig().discretisation, cable=OTHER)
     open_or_create(tmp_path / "data.zarr", DatasetConfig(n_trajectories=1, n_steps=1, discretisation=chain))

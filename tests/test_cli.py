@@ -102,6 +102,7 @@ def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
         (["simulate", "--seed", "-1"], "--seed is -1"),
         (["train", "--data", "nowhere.zarr"], "holds no data set"),
         (["bench", "simulate", "--batch", "0"], "--batch is 0"),
+        (["bench", "simulate", "--trajectories", "-1"], "--trajectories is -1, expected a whole number from 0"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import pathlib
 import shlex
+import types
 
 import pytest
 import tyro
@@ -17,6 +18,7 @@ from cablejax.commands.simulate import Simulate
 from cablejax.commands.train import Train
 from cablejax.control.shaping import load_model
 from cablejax.dataset.schema import DatasetConfig, Randomisation
+from cablejax.dynamics.train_config import PRESETS
 from cablejax.effects.given import parse_effect
 from cablejax.simulate.motions import MotionConfig
 
@@ -131,6 +133,14 @@ def test_a_verdicts_draws_are_dealt_out_to_the_trajectories(tmp_path):
 def test_a_data_set_beyond_the_options_says_so():
     config = DatasetConfig(interval=2.0)
     assert simulate_command(config, "name.zarr").startswith("# name.zarr: ")
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("steps", [1, 2, 3, 7, 1000])
+def test_a_training_has_as_many_steps_as_asked_for(preset, steps):
+    store = types.SimpleNamespace(config=DatasetConfig())
+    config = Train(preset=preset, steps=steps)._config(store, flips=True)  # pyright: ignore[reportArgumentType]
+    assert config.total_steps == steps and all(phase.steps > 0 for phase in config.phases)
 
 
 def test_only_what_was_changed_is_said_and_no_local_folder():

@@ -107,6 +107,19 @@ def test_input_that_is_refused_leaves_the_folder_free(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_input_that_is_refused_leaves_finished_results_finished(tmp_path):
+    (tmp_path / "report.html").write_text("of an earlier run")
+    with pytest.raises(ValueError, match="no good"), unfinished(tmp_path, SETTINGS, overwrite=True):
+        raise ValueError("no good")
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    with pytest.raises(ValueError, match="no good"), unfinished(tmp_path, SETTINGS, overwrite=True):
+        (tmp_path / "report.html").write_text("half of another")
+        raise ValueError("no good")
+    with pytest.raises(ValueError, match="no good"), unfinished(tmp_path, SETTINGS, overwrite=False):
+        raise ValueError("no good")
+    assert (tmp_path / "parts").exists(), "the page is not finished"
+
+
 @pytest.mark.parametrize("name", ["photos.txt", "settings.json", "U-residual.npz"])
 def test_a_folder_of_that_name_that_is_a_users_own_stays(name, made, weights, tmp_path, capsys):
     mine = tmp_path / "parts" / name
@@ -177,8 +190,11 @@ def test_demo_goes_on_after_ctrl_c_in_its_diagnosis(made, weights, tmp_path, cap
         raise DiagnosisError("too short")
 
     monkeypatch.setattr(diagnose, "diagnose_and_report", refused)
+    (tmp_path / "diagnosis" / "report.html").write_text("of another run")
+    (tmp_path / "diagnosis" / "notes.txt").write_text("mine")
     assert main(arguments) == 0
     assert made == ["residual", "direct"] and again == [tmp_path / "diagnosis"]
+    assert [path.name for path in again[0].iterdir()] == ["notes.txt"], "no diagnosis of another run"
     assert not (tmp_path / "parts").exists()
 
 

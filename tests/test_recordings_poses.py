@@ -53,6 +53,17 @@ def test_the_smallest_rotation_turns_one_into_the_other_about_their_normal():
     np.testing.assert_array_equal(smallest_rotation(np.array([1.0, 0, 0]), np.array([-1.0, 0, 0])), [0, 0, 0, 1])
 
 
+def test_a_tangent_that_is_not_known_leaves_the_other_frames_known():
+    angle = np.linspace(0, 1, 20)[:, None]
+    tangent = unit(np.concatenate([np.cos(3 * angle), np.sin(2 * angle), np.sin(5 * angle)], axis=1))
+    seen = np.delete(tangent, [0, 7], axis=0)
+    tangent[[0, 7]] = np.nan
+    quaternion = transported_frames(tangent)
+    assert np.isnan(quaternion[[0, 7]]).all()
+    np.testing.assert_array_equal(np.delete(quaternion, [0, 7], axis=0), transported_frames(seen))
+    assert np.isnan(transported_frames(tangent[[0, 7]])).all()
+
+
 def test_frames_are_transported_without_turning_about_the_tangent():
     angle = np.linspace(0, 1, 400)[:, None]
     tangent = unit(np.concatenate([np.cos(3 * angle), np.sin(2 * angle), np.sin(5 * angle)], axis=1))

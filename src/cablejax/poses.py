@@ -69,13 +69,19 @@ def poses_from_markers(
 
 
 def transported_frames(tangent: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4"]:
-    """Unit quaternions (scalar first) of frames with the tangent as x axis, by parallel transport, [T, 4]."""
-    quaternion = np.empty((len(tangent), 4))
-    quaternion[0] = smallest_rotation(_X, tangent[0])
-    turns = smallest_rotation(tangent[:-1], tangent[1:])
+    """Unit quaternions (scalar first) of frames with the tangent as x axis, by parallel transport, [T, 4].
+
+    Where a tangent is NaN its frame is, and the next one is transported from the last that is known.
+    """
+    frames = np.full((len(tangent), 4), np.nan)
+    known = np.isfinite(tangent).all(axis=-1)
+    ahead = tangent[known]
+    turns = smallest_rotation(np.concatenate([[_X], ahead])[:-1], ahead)
+    quaternion = np.empty(turns.shape)
     for t, turn in enumerate(turns):
-        quaternion[t + 1] = quaternion_product(turn, quaternion[t])
-    return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+        quaternion[t] = turn if t == 0 else quaternion_product(turn, quaternion[t - 1])
+    frames[known] = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    return frames
 
 
 def smallest_rotation(start: Float[np.ndarray, "*B 3"], end: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 4"]:

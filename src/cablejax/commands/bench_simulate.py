@@ -54,6 +54,7 @@ class BenchSimulate(Command):
 
         for name in ("batch", "seconds", "rounds", "threads", "steps"):
             require(getattr(self, name), "count", f"--{name}")
+        require(self.trajectories, "count_from_zero", "--trajectories")
         cable = find_cable(self.cable)
         engines: dict[str, Engine] = {name: kind(self.chain(cable, name)) for name, kind in ENGINES.items()}  # pyright: ignore[reportCallIssue]
         result = {

@@ -79,7 +79,7 @@ def find_cable(source: str | pathlib.Path | None) -> Cable:
         return cable_of_weights(path)
     from cablejax.cable_file import cable_of_log
 
-    return cable_of_log(recorded(path)[0])
+    return cable_of_log(recorded(pathlib.Path(source))[0])
 
 
 def cable_of_verdict(path: pathlib.Path) -> Cable | None:

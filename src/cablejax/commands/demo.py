@@ -6,6 +6,7 @@ import dataclasses
 import pathlib
 from typing import ClassVar, Literal
 
+from cablejax.commands.artefacts import PAGE
 from cablejax.commands.options import Command, say, text_table
 
 PUSHED_AT = 25.0
@@ -86,6 +87,8 @@ class Demo(Command):
         folder = self.out / "diagnosis"
         try:
             folder.mkdir(exist_ok=True)
+            for old in (PAGE, "verdict.json", "simulated.npz"):  # of another run, whose log goes
+                (folder / old).unlink(missing_ok=True)
             result, page = diagnose_and_report(until(read_gap_log(self.out / "log.npz"), PUSHED_AT), folder)
         except DiagnosisError as error:
             say(f"The gap was not diagnosed: {error}")

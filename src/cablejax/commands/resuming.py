@@ -150,14 +150,21 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
     with sole_writer(parts.folder):
         if not begun:
             parts.begin()
+        # what is there of an unfinished command is not finished by refusing this one
+        before = _stamps(out) if differing is None else {parts.folder.name: 0}
         try:
             yield parts
         except ValueError:
-            # input that is refused before anything was made of it leaves the folder free for other input
-            if parts.empty and list(out.iterdir()) == [parts.folder]:
+            # input that is refused before anything was made of it leaves the folder as it was
+            if parts.empty and _stamps(out) == before:
                 parts.remove()
             raise
         parts.remove()
+
+
+def _stamps(folder: pathlib.Path) -> dict[str, int]:
+    """When each file in a folder was last written, 0 for folders."""
+    return {file.name: 0 if file.is_dir() else file.stat().st_mtime_ns for file in folder.iterdir()}
 
 
 def _flatten(run: ClosedLoopRun) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import pathlib
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -178,7 +179,11 @@ class Train(Command):
         phases = config.phases
         if self.steps is not None:
             share = self.steps / config.total_steps
-            phases = tuple(dataclasses.replace(p, steps=max(1, round(share * p.steps))) for p in phases)
+            # of each phase the same share, and together as many as asked for: the shortest training has one phase
+            ends = [round(share * end) for end in itertools.accumulate((p.steps for p in phases), initial=0)]
+            counts = [after - before for before, after in itertools.pairwise(ends)]
+            pairs = zip(phases, counts, strict=True)
+            phases = tuple(dataclasses.replace(p, steps=count) for p, count in pairs if count)
             config = dataclasses.replace(config, warmup=min(config.warmup, round(share * config.warmup)))
         if self.lr is not None:
             share = self.lr / phases[0].lr_start
