@@ -98,7 +98,17 @@ def test_derivatives_match_finite_differences():
         np.testing.assert_allclose(jnp.sum(back * way), forward.sum(), rtol=1e-9)
 
 
-@pytest.mark.parametrize("wrong", [{"memory": 0.0}, {"prior_std": -1.0}, {"limits": ((1.0, 0.1), (-1.0, 1.0))}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"memory": 0.0},
+        {"prior_std": -1.0},
+        {"limits": ((1.0, 0.1), (-1.0, 1.0))},
+        {"limits": 1.0},
+        {"prior_mean": 0.0},
+        {"prior_mean": ("a", "b")},
+    ],
+)
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match="AdaptationConfig"):
         AdaptationConfig(**wrong)

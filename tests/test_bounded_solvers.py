@@ -244,12 +244,27 @@ def test_outside_compiled_code_failures_are_raised_with_what_to_do():
         (jnp.ones(2), {"max_steps": 0}, "max_steps is 0"),
         (jnp.ones(2), {"solver": BoundedQuasiNewton(atol=-1.0)}, "BoundedQuasiNewton: atol is -1.0"),
         (jnp.ones(2), {"solver": BoundedLevenbergMarquardt(rtol=float("nan"))}, "rtol is nan"),
+        (jnp.ones(2), {"solver": "lm"}, "The solver is 'lm'. Expected one of `cablejax.bounded`"),
+        (jnp.ones(2), {"solver": optx.BFGS(1e-6, 1e-6)}, r"BFGS reports no .*objective.* Expected one of `cablejax\."),
     ],
 )
 def test_what_no_solver_can_work_with_is_refused(start, options, message):
     options = {"solver": SOLVERS["quasi-Newton"], "feasible": Box(*map(jnp.asarray, UNIT)), **options}
     with pytest.raises(ValueError, match=message):
         minimise(lambda y, _: jnp.sum(y**2), y0=start, **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: SpectralProjectedGradient(memory=0), "memory is 0, expected a whole number of at least 1"),
+        (lambda: SpectralProjectedGradient(memory=2.5), "memory is 2.5, expected"),  # pyright: ignore[reportArgumentType]
+        (lambda: BoundedDogleg(trials_per_linearisation=0), "BoundedDogleg: trials_per_linearisation is 0, expected"),
+    ],
+)
+def test_solvers_that_would_try_nothing_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 # --- derivatives of the solution --------------------------------------------------------------------------------------

@@ -311,6 +311,8 @@ def test_a_policy_says_why_it_cannot_act():
         ({"targets": ()}, "targets is empty"),
         ({"steps": 0}, "ShapeCableConfig.steps"),
         ({"speed": np.nan}, "ShapeCableConfig.speed"),
+        ({"speed": 0.0}, r"ShapeCableConfig\.speed is 0\.0, expected a number from 1e-30"),
+        ({"turn_rate": 0.0}, r"ShapeCableConfig\.turn_rate is 0\.0"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(settings, message):

@@ -67,6 +67,12 @@ def test_assembly_pads_short_episodes(log):
     assert log.meta["keypoint_arclength_m"] == [0.0, 0.25, 0.5, 0.75, 1.0]
 
 
+@pytest.mark.parametrize("seconds", [0, -1.0, np.nan, "a"])
+def test_nothing_of_a_log_is_refused(log, seconds):
+    with pytest.raises(ValueError, match=r"seconds is .*, expected a number"):
+        until(log, seconds)
+
+
 def test_the_beginning_of_a_log(log):
     short = until(log, 0.55)
     validate(short)
@@ -410,7 +416,7 @@ class TestJoined:
         assert second.meta == {**logs[1].meta, "split": ["eval"], "recordings": parts}
         assert chosen(whole, range(2)).meta == whole.meta
 
-    @pytest.mark.parametrize("episodes", [[], [2], [-1], [1, 0], [0, 0]])
+    @pytest.mark.parametrize("episodes", [[], [2], [-1], [1, 0], [0, 0], [0.7], [True]])
     def test_episodes_that_are_not_there(self, log, episodes):
         with pytest.raises(GapLogError, match="expected increasing numbers below 2"):
             chosen(log, episodes)

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from cablejax.adaptation.belief import AdaptationConfig
 from cablejax.bounded import Result
 from cablejax.control.targets import Target
 from cablejax.mpc import MPC, Action, LevenbergMarquardt, MPCConfig, ProjectedGradient, time_control
 from cablejax.mpc.fallback import ABOUT, RETURNS, _followed, radius_after
 from cablejax.mpc.state import initial_state
 from cablejax.mpc.target_pose import straightened
+from cablejax.residual.learner import LearnerConfig
 from cablejax.types import History, Measurement
 from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
 
@@ -67,6 +69,16 @@ def test_brings_the_cable_to_the_target_and_holds_it_there(solver):
     size = np.linalg.norm(twists * [1, 1, 0.15], axis=-1)
     assert (size <= 0.05).all()
     assert size[-3:].max() < 2e-3
+
+
+def test_settings_given_as_lists_are_the_same_settings():
+    """Compiled code is kept by its settings, which lists cannot be."""
+    parts = {"workspace": [[-1.0, -1.0], [1.0, 1.0]]}
+    learner, belief = LearnerConfig(candidates=[*LearnerConfig.candidates]), AdaptationConfig(prior_mean=[0.0, 0.0])
+    listed = MPCConfig(residual=learner, adaptation=belief, **parts)
+    expected = MPCConfig(adaptation=AdaptationConfig(), workspace=((-1.0, -1.0), (1.0, 1.0)))
+    assert hash(listed) == hash(expected) and listed == expected
+    assert MPCConfig(workspace=np.array(parts["workspace"])) == MPCConfig(workspace=expected.workspace)
 
 
 def test_settings_scale_with_the_length():

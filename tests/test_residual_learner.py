@@ -164,6 +164,7 @@ def test_gradients_match_finite_differences():
     [
         ({"candidates": ()}, "expected one `Candidate` or more"),
         ({"candidates": (RidgeConfig(),)}, "expected one `Candidate` or more"),
+        ({"candidates": 3}, "expected one `Candidate` or more"),
         ({"window": 0}, "window is 0, expected a whole number from 1"),
         ({"error_std": 0.0}, "error_std is 0.0, expected"),
         ({"memory": 1.5}, "memory is 1.5"),

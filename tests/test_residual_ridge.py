@@ -195,6 +195,7 @@ def test_batches_over_cables():
         ({"regularisation": 0.0}, "regularisation"),
         ({"motion_scale": float("nan")}, "motion_scale"),
         ({"forgetting": 0.0}, "forgetting"),
+        ({"outlier": "a"}, r"outlier is 'a', expected a number .* with infinity all count fully"),
     ],
 )
 def test_impossible_settings_are_refused(change, message):

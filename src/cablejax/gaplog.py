@@ -19,7 +19,7 @@ from jaxtyping import Float
 from cablejax.cable import GRAVITY, Cable
 from cablejax.cable_file import NUMBERS
 from cablejax.gaplog_check import DTYPES, META_FIELDS, SCHEMA, GapLogError, validate
-from cablejax.limits import LIMITS
+from cablejax.limits import LIMITS, require
 from cablejax.npz import NpzError, read_npz
 from cablejax.text_file import parse_json
 from cablejax.types import GapLog
@@ -170,7 +170,12 @@ def episodes_of(log: GapLog) -> list[Episode]:
 
 
 def until(log: GapLog, seconds: float) -> GapLog:
-    """The first seconds of every episode; a positive number keeps at least one sample of each."""
+    """The first seconds of every episode, at least one sample of each.
+
+    Raises:
+        ValueError: the seconds are no positive number.
+    """
+    require(seconds, "positive", "seconds", "The first sample of an episode is always kept.")
     fields = ("time", "keypoints", "gripper_pose", "gripper_command", "hold")
     episodes = [
         dataclasses.replace(one, **{name: getattr(one, name)[one.time - one.time[0] < seconds] for name in fields})

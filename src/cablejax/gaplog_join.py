@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from cablejax.gaplog import TARGETS, Episode, episodes_of, stack_episodes, targets_of
 from cablejax.gaplog_check import META_FIELDS, GapLogError
-from cablejax.limits import shown
+from cablejax.limits import LIMITS, shown
 from cablejax.types import GapLog
 
 MEASURED = 0.005
@@ -188,9 +188,12 @@ def chosen(log: GapLog, episodes: Sequence[int]) -> GapLog:
     Raises:
         GapLogError: numbers that the log does not have, or in another order.
     """
-    total, numbers = len(log.episode_length), [int(episode) for episode in episodes]
-    if not numbers or numbers != sorted({*numbers} & {*range(total)}):
-        raise GapLogError(f"The episodes {shown(numbers)} were asked for, expected increasing numbers below {total}.")
+    total, numbers = len(log.episode_length), list(episodes)
+    whole = all(number in LIMITS["count_from_zero"] for number in numbers)
+    if not numbers or not whole or numbers != sorted({*numbers} & {*range(total)}):
+        raise GapLogError(
+            f"The episodes {shown(numbers)} were asked for, expected increasing numbers below {total}, whole ones."
+        )
     meta = dict(log.meta)
     for name, value in log.meta.items():
         of_cable = name in META_FIELDS or name == "guessed"

@@ -147,12 +147,26 @@ def check(settings: object, *names: str, **others: str) -> None:
         require(getattr(settings, field), limit, f"{type(settings).__name__}.{field}")
 
 
+def make_hashable(settings: object, *fields: str) -> None:
+    """Replaces lists and arrays in fields of a frozen dataclass by tuples: compiled code is kept by its settings."""
+
+    def frozen(value: Any) -> Any:
+        value = value.tolist() if hasattr(value, "__array__") else value
+        return tuple(map(frozen, value)) if isinstance(value, list | tuple) else value
+
+    for field in fields:
+        object.__setattr__(settings, field, frozen(getattr(settings, field)))
+
+
 def check_workspace(settings: Any) -> None:
     """Rejects settings whose field `workspace` is neither None nor two corners of a rectangle, the lowest first.
+
+    Lists become tuples.
 
     Raises:
         ValueError: names the field.
     """
+    make_hashable(settings, "workspace")
     if settings.workspace is None:
         return
     try:

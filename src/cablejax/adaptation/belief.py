@@ -17,10 +17,9 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from cablejax.limits import check
+from cablejax.limits import LIMITS, check, make_hashable, shown
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,17 +50,25 @@ class AdaptationConfig:
 
     def __post_init__(self):
         check(self, prior_std="positive", error_std="positive", memory="share", outlier="positive", max_step="positive")
-        if np.shape(self.limits) != (2, 2) or not all(low <= high for low, high in self.limits):
+        make_hashable(self, "prior_mean", "limits")
+        if not _numbers(self.limits, (2, 2)) or not all(low <= high for low, high in self.limits):
             raise ValueError(
-                f"AdaptationConfig.limits are {self.limits}, expected the smallest and the largest log ratio of "
+                f"AdaptationConfig.limits are {shown(self.limits)}, expected the smallest and the largest log ratio of "
                 "stiffness, and those of friction."
             )
-        within = (low <= mean <= high for mean, (low, high) in zip(self.prior_mean, self.limits, strict=False))
-        if len(self.prior_mean) != 2 or not all(within):
+        pairs = zip(self.prior_mean, self.limits, strict=True) if _numbers(self.prior_mean, (2,)) else ()
+        if not pairs or not all(low <= mean <= high for mean, (low, high) in pairs):
             raise ValueError(
-                f"AdaptationConfig.prior_mean is {self.prior_mean}, expected the log ratios of stiffness and friction "
-                f"within {self.limits}."
+                f"AdaptationConfig.prior_mean is {shown(self.prior_mean)}, expected the log ratios of stiffness and "
+                f"friction within {self.limits}."
             )
+
+
+def _numbers(values: object, shape: tuple[int, ...]) -> bool:
+    """Whether a value is tuples of finite numbers of a shape."""
+    if not shape:
+        return values in LIMITS["finite"]
+    return isinstance(values, tuple) and len(values) == shape[0] and all(_numbers(one, shape[1:]) for one in values)
 
 
 @jax.tree_util.register_dataclass

@@ -123,6 +123,13 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     trials_per_linearisation: int = eqx.field(static=True, default=1)
     norm: Callable[[PyTree], Scalar] = eqx.field(default=optx.max_norm)
 
+    def __check_init__(self):
+        if not isinstance(self.trials_per_linearisation, int) or self.trials_per_linearisation < 1:
+            raise ValueError(
+                f"{type(self).__name__}: trials_per_linearisation is {self.trials_per_linearisation!r}, expected a "
+                "whole number of at least 1."
+            )
+
     @property
     @abc.abstractmethod
     def descent(self) -> ModelDescent:

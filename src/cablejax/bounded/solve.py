@@ -16,6 +16,8 @@ from cablejax.bounded.objective import derivative_along, forward, squared_jacobi
 from cablejax.bounded.results import Result, Solution, Stats, result_of
 from cablejax.bounded.sets import AbstractSet
 
+_SOLVERS = "Expected one of `cablejax.bounded`, such as BoundedLevenbergMarquardt() or BoundedQuasiNewton()."
+
 
 def minimise(
     fn: Callable[[Array, Any], Array],
@@ -99,13 +101,22 @@ def _solve(entry, fn, solver, y0, feasible: AbstractSet, args, option: str, give
     fn = eqx.filter_closure_convert(fn, start, args)
     given = None if given is None else eqx.filter_closure_convert(given, start, args)
     options = {"feasible": feasible, option: given}
-    out = entry(fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False)
+    out: optx.Solution = entry(
+        fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False
+    )
+    if missing := {"objective", "optimality", "evaluations", "linearisations"} - {*out.stats}:
+        raise ValueError(
+            f"The solver {type(solver).__name__} reports no {', '.join(sorted(missing))}. {_SOLVERS} Optimistix' own "
+            "solvers keep to no feasible set."
+        )
     unknown = jnp.isnan(y0).any() | ~jnp.isfinite(start).all()
     return _finish(out, fn, args, feasible, start, unknown, throw)
 
 
 def _checked(solver, y0, feasible, max_steps: int) -> tuple[Array, Array]:
     """The start as an array, and its projection; raises ValueError for what no solver can work with."""
+    if not isinstance(solver, optx.AbstractMinimiser | optx.AbstractLeastSquaresSolver):
+        raise ValueError(f"The solver is {solver!r}. {_SOLVERS}")
     if not isinstance(feasible, AbstractSet):
         raise ValueError(f"feasible is {feasible!r}, expected a set: Box, Balls, Halfspaces, Intersection or your own.")
     if not eqx.is_array_like(y0) or jnp.size(y0) == 0:

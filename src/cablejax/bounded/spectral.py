@@ -157,6 +157,8 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
             initial_length: length of the first step, relative to the gradient.
             lengths: least and greatest length of a step, relative to the gradient.
         """
+        if not isinstance(memory, int) or memory < 1:
+            raise ValueError(f"SpectralProjectedGradient: memory is {memory!r}, expected a whole number of at least 1.")
         self.descent = ProjectionArc(None, initial_length, *lengths)
         self.search = NonmonotoneArmijo(memory)
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm

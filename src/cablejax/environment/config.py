@@ -57,6 +57,8 @@ class ShapeCableConfig:
     keypoint_noise: float = 0.0
 
     def __post_init__(self):
+        # a policy divides by both
+        check(self, speed="positive", turn_rate="positive")
         check(self, "speed", "interval", steps="commands", turn_rate="speed", tolerance="share", keypoint_noise="noise")
         for name, kind in (("discretisation", Discretisation), ("randomisation", Randomisation)):
             if not isinstance(getattr(self, name), kind):

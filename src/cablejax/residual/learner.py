@@ -36,7 +36,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from cablejax.limits import check
+from cablejax.limits import check, make_hashable
 from cablejax.residual.jacobian import Linearised
 from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit, zero_residual
 from cablejax.types import ROTATION_WEIGHT
@@ -102,7 +102,9 @@ class LearnerConfig:
     dimensions: float = 4.0
 
     def __post_init__(self):
-        if not self.candidates or not all(isinstance(candidate, Candidate) for candidate in self.candidates):
+        make_hashable(self, "candidates")
+        every = self.candidates if isinstance(self.candidates, tuple) else ()
+        if not every or not all(isinstance(candidate, Candidate) for candidate in every):
             raise ValueError(f"LearnerConfig.candidates are {self.candidates}, expected one `Candidate` or more.")
         check(
             self,

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from cablejax.limits import check
+from cablejax.limits import check, require
 from cablejax.types import ROTATION_WEIGHT
 
 BIAS_SCALE = 5.0
@@ -60,8 +60,8 @@ class RidgeConfig:
             rotation_weight="positive",
             forgetting="share",
         )
-        if not self.outlier > 0:
-            raise ValueError(f"RidgeConfig.outlier is {self.outlier}, expected a positive number [m], or infinity.")
+        if self.outlier != math.inf:
+            require(self.outlier, "positive", "RidgeConfig.outlier", "It is in metres; with infinity all count fully.")
 
     def scaled(self, ratio: float, interval: float = 1.0) -> RidgeConfig:
         """The settings scaled to another cable length and another duration of a step."""
