@@ -14,14 +14,14 @@ PIXELS = 480
 """Width and height of a picture."""
 _DPI = 100
 _MARGIN = 0.08
-"""Space for a gripper's body beyond its pose [m]."""
+"""Space for a gripper's body beyond its pose [lengths of the cable]."""
 
 
 def picture(
     keypoints: Float[np.ndarray, "N 2"],
     gripper_pose: Float[np.ndarray, "2 3"],
     target: Float[np.ndarray, "N 2"],
-    half_width: float,
+    length: float,
 ) -> UInt8[np.ndarray, "480 480 3"]:
     """Draws the table from above, the target dashed.
 
@@ -29,15 +29,15 @@ def picture(
         keypoints: observed [m].
         gripper_pose: (x, y, theta) [m, rad].
         target: wanted keypoints [m].
-        half_width: largest coordinate of a gripper [m]; the origin is in the middle.
+        length: of the cable [m]; the table is three lengths wide, and the origin is in the middle.
     """
-    half = half_width + _MARGIN
+    half = (1.5 + _MARGIN) * length
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(PIXELS / _DPI, PIXELS / _DPI), dpi=_DPI)
         ax = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(-half, half), ylim=(-half, half))
         ax.set_axis_off()
         ax.plot(*cable_curve(target).T, color=LIGHT.target, lw=2.2, ls=(0, (2.4, 1.7)))
-        draw_grippers(ax, gripper_pose)
+        draw_grippers(ax, gripper_pose, length)
         ax.plot(*cable_curve(keypoints).T, color=LIGHT.residual, lw=2.2, solid_capstyle="round")
         ax.plot(*keypoints.T, color=LIGHT.residual, ls="", marker="o", ms=3.4)
         canvas = FigureCanvasAgg(figure)

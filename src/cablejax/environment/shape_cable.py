@@ -63,7 +63,7 @@ def _pictures(env: gymnasium.Env | gymnasium.vector.VectorEnv, cables: Cables) -
         return []
     _require_reset(cables)
     parts = zip(cables.keypoints, cables.gripper_pose, cables.target, strict=True)
-    return [picture(*part, 1.5 * cables.config.cable.length) for part in parts]
+    return [picture(*part, cables.config.cable.length) for part in parts]
 
 
 class ShapeCableEnv(gymnasium.Env):
