@@ -12,7 +12,7 @@ import pytest
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.physics import nominal_physics
-from cablejax.simulate import MjxEngine, ThreadedEngine
+from cablejax.simulate import ChainEngine, MjxEngine, ThreadedEngine
 from cablejax.simulate.composite import build_grasped_chain
 
 PLANAR = Discretisation(n_links=25)
@@ -60,6 +60,24 @@ def test_mjx_follows_c_mujoco_within_a_hundredth_of_a_millimetre(config, pose, t
     assert moved > 0.02
     assert np.abs(np.asarray(trajectory.keypoints - reference.keypoints)).max() <= 1e-5
     np.testing.assert_allclose(trajectory.gripper_pose, reference.gripper_pose, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    "cable",
+    [
+        Cable(length=5.0, diameter=0.05, linear_density=2.0, bending_stiffness=50.0),
+        Cable(length=0.05, diameter=0.001, linear_density=0.001, bending_stiffness=1e-6, damping_time=0.02),
+    ],
+    ids=["stiff hose", "short"],
+)
+def test_c_mujoco_holds_cables_of_any_size(cable):
+    config, size = Discretisation(cable), np.array([cable.length, cable.length, 1.0])
+    threaded, chain = ThreadedEngine(config, n_threads=1), ChainEngine(config)
+    pose, twist = planar_pose() * size, np.tile(planar_twist(), (3, 1, 1)) * size
+    state, params = chain.initial_state(pose), nominal_physics(config)
+    _, reference = chain.rollout(params, state, twist)
+    _, trajectory = threaded.rollout(params, state, twist)
+    assert np.abs(np.asarray(trajectory.keypoints - reference.keypoints)).max() <= 1e-3 * cable.length
 
 
 @pytest.mark.skipif(mujoco.__version__ >= "4", reason="MuJoCo 4 has no cable plugin")

@@ -218,8 +218,9 @@ def simulate(
             return [Block(**{name: part[i] for name, part in parts.items()}) for i in range(len(shards))]
     raise ValueError(
         f"{len(problems)} trajectories failed {MAX_ATTEMPTS} times in a row; number {rows[pending[0]]}: "
-        f"{problems[pending[0]]}. Another engine, time step or number of links may help: --engine threaded, "
-        "--timestep, --links. A soft cable on a rough table needs another engine or fewer links."
+        f"{problems[pending[0]]}. Another engine, time step or number of links may help: --engine "
+        f"{' or '.join(name for name in ENGINES if name != config.engine)}, --timestep, --links. A soft cable on a "
+        "rough table needs another engine or fewer links."
     )
 
 

@@ -21,9 +21,11 @@ import numpy as np
 
 from cablejax.cable import GRAVITY, Discretisation
 
-# A weld is as soft as the lighter body is light. The held links are held anyway, so C MuJoCo gets them heavy.
-_HELD_MASS = 10.0  # [kg]
-_HELD_INERTIA = 0.04  # [kg m^2], a sphere of 10 cm
+# A weld is as soft as the lighter body is light. The held links are held anyway, so C MuJoCo gets them heavy: in masses
+# of the cable, and of that mass times its length squared. One mass for every cable is too light for the moments of a
+# stiff one, and so heavy for a short one that rounding moves the rest.
+_HELD_MASS = 125.0
+_HELD_INERTIA = 0.5
 # Constraint impedance, as close to a rigid weld as MuJoCo allows.
 _RIGID = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
@@ -49,9 +51,10 @@ def build_grasped_chain(config: Discretisation) -> mujoco.MjModel:
     spec, links = _chain_spec(config)
     # a simulation that diverges shall say so, not start again in silence
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    mass = config.cable.linear_density * config.cable.length
     for link in (links[0], links[-1]):
-        link.mass = _HELD_MASS
-        link.inertia = [_HELD_INERTIA] * 3
+        link.mass = _HELD_MASS * mass
+        link.inertia = [_HELD_INERTIA * mass * config.cable.length**2] * 3
     tip = [config.link_length / 2, 0.0, 0.0]
     dt = config.timestep
     for index, (link, anchor) in enumerate(((links[0], [0.0, 0.0, 0.0]), (links[-1], tip))):
