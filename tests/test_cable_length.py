@@ -56,7 +56,9 @@ def take() -> Take:
 
 def test_a_log_in_space_is_checked():
     log = gap_log_from_takes([take()], NOMINAL, source="test")
-    windows_of(log)
+    # its length fits, but nothing of it moves by itself
+    with pytest.raises(ValueError, match="All 13 keypoints move with the grippers, as if the cable were rigid"):
+        windows_of(log)
     meta = {**log.meta, "cable": {**log.meta["cable"], "length_m": 0.9}, NAME.split(".")[1]: (0.9 * MARKS).tolist()}
     with pytest.raises(ValueError, match=r"correct meta\.keypoint_arclength_m"):
         windows_of(dataclasses.replace(log, meta=meta))

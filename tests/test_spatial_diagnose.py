@@ -138,6 +138,14 @@ def test_finds_the_file_that_was_gripped_anew():
     assert local_changes(cases.recording(), (2, 2)) == ()
 
 
+def test_keypoints_that_single_files_do_not_show_say_nothing_of_their_geometry():
+    log = cases.recording(regripped=2)
+    keypoints = log.keypoints.copy()
+    keypoints[0, :, 4] = keypoints[:, :, 7] = np.nan
+    hidden = dataclasses.replace(log, keypoints=keypoints)
+    assert local_changes(hidden, (2, 2)) == local_changes(log, (2, 2))
+
+
 def test_halves_keep_recordings_together():
     group = np.array([0, 0, 0, 1, 1, 2, 3, 3])
     first = halves(group)
@@ -303,6 +311,26 @@ def test_one_window_is_too_little_and_one_that_ends_at_once_is_left_out():
     keypoints[1, 2:, 1:-1] = np.nan
     windows = windows_of(dataclasses.replace(whole, keypoints=keypoints))
     assert len(windows) == 3 and len(windows.left_out) == 1
+
+
+def test_a_window_that_no_fit_sees_is_left_out():
+    log = cases.recording()
+    keypoints = log.keypoints.copy()
+    keypoints[1, 2::4] = np.nan
+    windows = windows_of(dataclasses.replace(log, keypoints=keypoints))
+    # its first two samples of all keypoints are 0 and 1
+    assert windows.episode.tolist() == [0, 2, 3] and len(windows.left_out) == 1
+    evidence = SpatialCable(Rod(8, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows).evidence()
+    assert evidence.count.min() > 0
+
+
+def test_of_one_whole_window_the_short_ones_are_used_too():
+    """A recording of 8 s is one window of 5 s and one of 3 s: a search holds either out."""
+    windows = windows_of(cases.recording(2))
+    short = dataclasses.replace(windows, valid=windows.valid & (np.arange(100) < [[100], [60]]))
+    assert short.whole(24).tolist() == [0, 1]
+    first = halves(short.chosen(short.whole(24)).group)
+    assert first.any() and not first.all()
 
 
 def test_a_recording_at_another_rate_is_sampled_again():

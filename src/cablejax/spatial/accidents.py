@@ -101,7 +101,7 @@ def accident_sentences(
         more = f" and {count - _SHOWN} more" if count > _SHOWN else ""
         result.append(
             f"{count} more windows were left out, since none of their seconds begins with two samples of all "
-            f"keypoints: {', '.join(windows.left_out[:_SHOWN])}{more}."
+            f"keypoints, or too little is observed later: {', '.join(windows.left_out[:_SHOWN])}{more}."
         )
     return result
 

@@ -24,7 +24,7 @@ from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.accidents import moderated, trust
 from cablejax.spatial.effects import GRIP, Layout
-from cablejax.spatial.windows import Windows
+from cablejax.spatial.windows import FITTED, Windows
 
 GOOD_FIT = 0.01
 """Error of a good fit [m]: unit of the residuals."""
@@ -38,8 +38,6 @@ _LOST = 1.0
 # In fits it counts for less: one lost window must not outweigh all others.
 _ROBUST = Robust(distance=0.02, lost=0.1, steepest=10.0)
 _CORRELATION = 0.3  # [s]
-# Samples that fits look at: every fourth, after the two that the simulation begins from.
-_FITTED = slice(2, None, 4)
 # The rod that predictions are corrected by has so many edges for each of this one, and so many time steps. With more
 # than 32 edges XLA shares its small products among threads, which costs more time than the edges.
 FINER = 4
@@ -141,7 +139,7 @@ class SpatialCable(Simulator):
     def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T F 3"]:
         """Free markers [m] at the samples that are compared; NaN from where on the simulation was not solved."""
         parts = ((self._in_parallel(0, one, episodes, ())) for one in explanations)
-        found = np.stack([np.concatenate([points for points, _ in part])[:, _FITTED] for part in parts])
+        found = np.stack([np.concatenate([points for points, _ in part])[:, FITTED] for part in parts])
         return found if self.correction is None else found + self.correction[episodes]
 
     def linearise(self, explanations, episodes):
@@ -169,19 +167,19 @@ class SpatialCable(Simulator):
         rows = np.zeros((max(_COLUMNS * -(-count // _COLUMNS), _COLUMNS), self.layout.size))
         rows[:count] = directions
         parts = self._in_parallel(1, one, episodes, (rows,))
-        predicted = np.concatenate([part[0] for part in parts])[:, _FITTED]
-        slopes = np.concatenate([part[1][:, :, _FITTED] for part in parts])
+        predicted = np.concatenate([part[0] for part in parts])[:, FITTED]
+        slopes = np.concatenate([part[1][:, :, FITTED] for part in parts])
         return predicted, np.moveaxis(slopes, 1, 0)[:count]
 
     def evidence(self) -> Evidence:
         """The windows, weighed for fits."""
-        windows, stride = self.windows, _FITTED.step
+        windows, stride = self.windows, FITTED.step
         unit = GOOD_FIT * np.sqrt(3 * _CORRELATION / (stride * windows.interval))
         return Evidence(
             simulator=self,
             episodes=np.arange(len(windows)),
-            observed=windows.observed[:, _FITTED],
-            nominal=np.zeros_like(windows.keypoints[:, _FITTED]),
+            observed=windows.observed[:, FITTED],
+            nominal=np.zeros_like(windows.keypoints[:, FITTED]),
             noise=np.full((windows.keypoints.shape[2], 1), unit),
             temper=np.ones(len(windows)) if windows.trust is None else 1 / windows.trust,
             freedom=LEAST_SQUARES,

@@ -30,6 +30,8 @@ def local_changes(log: GapLog, held: tuple[int, int]) -> tuple[str, ...]:
     s, names, found = np.asarray(log.meta["keypoint_arclength_m"], float), labels(log, "file", "take"), []
     for k, gripper in enumerate(grippers):
         column = spacing[:, k]
+        if not np.isfinite(column).any():
+            continue
         usual = np.nanmedian(column)
         scatter = 1.4826 * np.nanmedian(np.abs(column - usual))
         least = _SMALLEST if gripper is not None else _SMALLEST_FREE
@@ -50,12 +52,16 @@ def local_changes(log: GapLog, held: tuple[int, int]) -> tuple[str, ...]:
 
 
 def pair_distances(log: GapLog, rigid: Sequence[bool]) -> Float[np.ndarray, "E M"]:
-    """Distance of neighbouring keypoints in every episode [m]: the median where `rigid`, else nearly the largest."""
-    rows = []
-    for points, count in zip(log.keypoints, log.episode_length, strict=True):
+    """Distance of neighbouring keypoints in every episode [m]: the median where `rigid`, else nearly the largest.
+
+    NaN where the two are never observed together.
+    """
+    rows = np.full((len(log.keypoints), len(rigid)), np.nan)
+    for row, points, count in zip(rows, log.keypoints, log.episode_length, strict=True):
         distance = np.linalg.norm(np.diff(np.asarray(points[:count], float), axis=1), axis=-1)
-        rows.append(np.where(rigid, np.nanmedian(distance, axis=0), np.nanquantile(distance, _QUANTILE, axis=0)))
-    return np.array(rows)
+        for k in np.flatnonzero(np.isfinite(distance).any(axis=0)):
+            row[k] = np.nanquantile(distance[:, k], 0.5 if rigid[k] else _QUANTILE)
+    return rows
 
 
 def _ranges(files):

@@ -20,6 +20,8 @@ from cablejax.types import GapLog
 
 WINDOW = 5.0
 """Length of a window [s]: so far ahead the simulator predicts from two observations."""
+FITTED = slice(2, None, 4)
+"""Samples of a window that fits look at: every fourth, after the two that the simulation begins from."""
 _SHORTEST = 1.0
 # Part of a window that must be recorded for it to be a whole one.
 _WHOLE = 0.8
@@ -53,7 +55,8 @@ class Windows:
         trust: weight of each window in fits, shape [W]; None = 1.
         smoothed: what was taken from the measured paths of the clamps so that they are smooth, root mean square of a
             coordinate [m].
-        left_out: where the log has windows without a second that begins with two samples of all keypoints, in words.
+        left_out: where the log has windows without a second that begins with two samples of all keypoints, or in which
+            fits see nothing later, in words.
     """
 
     keypoints: Float[np.ndarray, "W T F 3"]
@@ -82,11 +85,11 @@ class Windows:
     def whole(self, count: int) -> Int[np.ndarray, "S"]:
         """Indices of at most `count` windows that are recorded in full and not torn, spread evenly.
 
-        Of any windows, where there are none of these.
+        Where fewer than two are, of all that are not torn, else of any: of one window nothing can be held out.
         """
-        whole = np.flatnonzero((self.valid.mean(axis=1) >= _WHOLE) & ~self.torn)
-        if not len(whole):
-            whole = np.arange(len(self))
+        intact = ~self.torn
+        wanted = (self.valid.mean(axis=1) >= _WHOLE) & intact, intact
+        whole = np.flatnonzero(next((each for each in wanted if each.sum() > 1), np.ones(len(self), bool)))
         return whole[np.unique(np.linspace(0, len(whole) - 1, count).astype(int))]
 
     @property
@@ -159,6 +162,11 @@ def windows_of(log: GapLog) -> Windows:
     first = s[held[0] - 1] if held[0] else s[0]
     last = s[len(s) - held[1]] if held[1] else s[-1]
     free = slice(held[0], len(s) - held[1])
+    if held[0] + held[1] >= len(s):
+        raise ValueError(
+            f"All {len(s)} keypoints move with the grippers, as if the cable were rigid: expected at least one that "
+            "bending moves across both grippers' axes. Record a cable that hangs free between them."
+        )
     recording = labels(log, "recording")
     groups = {r: i for i, r in enumerate(dict.fromkeys(recording))}
     files, splits = labels(log, "file", "take"), labels(log, "split", default="")
@@ -206,7 +214,7 @@ def windows_of(log: GapLog) -> Windows:
 def _pieces(
     points: Float[np.ndarray, "E T F 3"], length: Int[np.ndarray, "E"], samples: int, least: int
 ) -> tuple[list[tuple[int, int, int]], list[tuple[int, int]]]:
-    """Windows (episode, first sample, samples), and those left out: no two whole samples, or nothing later."""
+    """Windows (episode, first sample, samples), and those left out: no two whole samples, or fits see nothing later."""
     pieces, left_out = [], []
     for e, count in enumerate(length):
         for begin in range(0, int(count), samples):
@@ -217,8 +225,7 @@ def _pieces(
             seen = np.asarray(np.isfinite(points[e, begin:end]).all(axis=(1, 2)))
             whole = np.flatnonzero(seen[:-1] & seen[1:])
             start = begin + int(whole[0]) if len(whole) else end
-            later = points[e, start + 2 : end]
-            if end - start >= least and (np.isfinite(later).any() or not later.size):
+            if end - start >= least and np.isfinite(points[e, start:end][FITTED]).any():
                 pieces.append((e, start, end - start))
             else:
                 left_out.append((e, begin))
