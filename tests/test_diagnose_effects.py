@@ -74,7 +74,19 @@ def test_an_effect_given_twice_acts_twice_or_is_refused(effect):
     # where the order matters, the second takes something from the first
     one, another = both(once, other), both(other, once)
     same = all(np.allclose(getattr(one, f.name), getattr(another, f.name)) for f in dataclasses.fields(one))
+    # a factor that is stated as a value does not set that value where it finds another
+    stated = effect.reported(once, effect.variants[0], chain)
+    same &= all(name != "ratio" or name in stated for name in (p.name for p in effect.parameters))
+    # two cameras show what the second makes of the first one's image
+    first, second = (effect.apply(believed, values, effect.variants[0], chain) for values in (once, other))
+    point = np.array([[0.3, -0.2]])
+    same &= np.allclose(in_camera_frame(one, point), in_camera_frame(second, in_camera_frame(first, point)))
     assert same != effect.alone
+
+
+def test_a_time_is_given_once():
+    with pytest.raises(ValueError, match="has a time twice, expected from_s and until_s once"):
+        parse_effect("bending_stiffness:ratio=2,from_s=1,from_s=2")
 
 
 @pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda e: e.name)

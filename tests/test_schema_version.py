@@ -170,3 +170,20 @@ def test_a_verdict_in_other_units_is_refused(tmp_path):
     with pytest.raises(ValueError, match="lumped_mass has mass_kg in 'g', expected 'kg'"):
         read("g")
     assert read("kg") == read(None)
+
+
+@pytest.mark.parametrize(("index", "counts"), [([], "0 and 2"), ([3], "1 and 2"), ([3, 4, 5], "2 and 3")])
+def test_a_verdict_whose_pieces_do_not_fit_together_is_refused(index, counts, tmp_path):
+    """Of empty lists no effect was left, without a word."""
+
+    def read(index, offset):
+        parameters = {"index": {"value": index}, "offset_m": {"value": offset, "unit": "m"}}
+        verdict = {"schema": "cablejax-verdict/1", "effects": [{"name": "keypoint_bias", "parameters": parameters}]}
+        (tmp_path / "verdict.json").write_text(json.dumps(verdict))
+        return effects_of_verdict(tmp_path / "verdict.json")
+
+    with pytest.raises(ValueError, match=f"'keypoint_bias' has lists of {counts} values, expected lists of one length"):
+        read(index, [0.01, 0.02])
+    with pytest.raises(ValueError, match="has lists of 0 values"):
+        read([], [])
+    assert len(read([3, 4], [0.01, 0.02])) == 2

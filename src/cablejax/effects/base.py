@@ -59,7 +59,7 @@ class CableEffect(Effect, abc.ABC):
     stage: ClassVar[int] = 0
     """Effects of a later stage change what those of earlier ones have made, in whatever order they are given."""
     alone: ClassVar[bool] = False
-    """Whether a simulation has one of them at a time: a second one would take something of the first's place."""
+    """Whether a simulation has one of them at a time: with a second one the first is not as it was stated."""
 
     def __init__(self):
         self.__post_init__()

@@ -34,6 +34,7 @@ class CameraSimilarity(CableEffect):
     )
     null = (1.0, 0.0, 0.0, 0.0)
     side = "observation"
+    alone = True
     origin = (0.0, 0.0)
     """Place that the keypoints are scaled and turned about in the fit [m]."""
 

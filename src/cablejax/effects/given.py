@@ -138,13 +138,15 @@ def with_effects(physics: Physics, effects: Iterable[GivenEffect], chain: Discre
     """The physics with every effect, applied in order of their stages.
 
     Raises:
-        ValueError: an effect of which there can be one at a time is given twice, or see `GivenEffect.applied`.
+        ValueError: an effect of which there can be one at a time is given twice for one time, or see
+            `GivenEffect.applied`.
     """
     ordered = sorted(effects, key=lambda one: one.effect.stage)
     for one, other in itertools.combinations(ordered, 2):
         if one.name == other.name and one.effect.alone and one.meets(other):
             raise ValueError(
-                f"{one.name} is given twice ({one}; {other}), but a simulation has each effect once: leave one out."
+                f"{one.name} is given twice ({one}; {other}), but a simulation has each effect once: leave one out, or "
+                "let one end (until_s) before the other begins (from_s)."
             )
     for effect in ordered:
         physics = effect.applied(physics, chain)
@@ -173,6 +175,8 @@ def parse_effect(text: str) -> GivenEffect:
             )
         parameters.append((key.strip(), value))
     times = {key: value for key, value in parameters if key in ("from_s", "until_s")}
+    if sum(key in times for key, _ in parameters) > len(times):
+        raise ValueError(f"Effect {shown(text)} has a time twice, expected from_s and until_s once.")
     return GivenEffect(name.strip(), tuple(pair for pair in parameters if pair[0] not in times), **times)
 
 

@@ -156,6 +156,7 @@ class BendingDamping(CableEffect):
     symmetric = True
     parameters = (Parameter("ratio", "", 0.01, 1000.0, 1.0, 1.5, log=True),)
     null = (1.0,)
+    alone = True
 
     def apply(self, physics, values, variant, config):
         """Multiplies the damping time of every joint by the ratio."""

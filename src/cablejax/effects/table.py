@@ -36,7 +36,7 @@ class TableFriction(CableEffect):
     )
     null = (1.0, 0.0)
     variants = (0, 1)
-    amplitude, reversible = 0, True
+    amplitude, reversible, alone = 0, True, True
 
     def apply(self, physics, values, variant, config):
         """Multiplies the coefficient by the ratio; in variant 1 also sets the excess of static friction."""

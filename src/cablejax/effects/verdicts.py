@@ -91,7 +91,13 @@ def _pieces(effect: Any, path: Any) -> list[GivenEffect]:
     try:
         values = {name: entry["value"] for name, entry in effect["parameters"].items()}
         _check_units(effect["name"], {name: entry.get("unit") for name, entry in effect["parameters"].items()}, path)
-        count = max((len(value) for value in values.values() if isinstance(value, list)), default=1)
+        counts = {len(value) for value in values.values() if isinstance(value, list)}
+        if len(counts) > 1 or 0 in counts:
+            raise ValueError(
+                f"{path}: {shown(effect['name'])} has lists of {' and '.join(map(str, sorted(counts)))} values, "
+                "expected lists of one length, at least 1: a value of each parameter for each piece."
+            )
+        count = max(counts, default=1)
         rows = [
             tuple((name, value[i] if isinstance(value, list) else value) for name, value in values.items())
             for i in range(count)

@@ -59,7 +59,7 @@ def pair_distances(log: GapLog, rigid: Sequence[bool]) -> Float[np.ndarray, "E M
     rows = np.full((len(log.keypoints), len(rigid)), np.nan)
     for row, points, count in zip(rows, log.keypoints, log.episode_length, strict=True):
         distance = np.linalg.norm(np.diff(np.asarray(points[:count], float), axis=1), axis=-1)
-        for k in np.flatnonzero(np.isfinite(distance).any(axis=0)):
+        for k in np.flatnonzero(np.isfinite(distance).any(axis=0)).tolist():
             row[k] = np.nanquantile(distance[:, k], 0.5 if rigid[k] else _QUANTILE)
     return rows
 
