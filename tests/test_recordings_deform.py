@@ -137,9 +137,10 @@ def test_wrong_folders_are_refused(folder, tmp_path):
         ({"keypoints": np.zeros((4, 200, 9, 2))}, r"keypoints has shape \(4, 200, 9, 2\)"),
         ({"keypoints": np.zeros((4, 200, 9, 3), int)}, "expected floating point numbers"),
         ({"split": np.array(["train"])}, r"split has shape \(1,\), expected \(4,\)"),
+        ({"split": np.array(["train", "Eval", "train", "train"])}, "split has 'Eval', expected train, eval, which is"),
         ({"dt": np.float32(np.nan)}, "dt is nan"),
     ],
-    ids=["missing", "planar", "integers", "split", "dt"],
+    ids=["missing", "planar", "integers", "split", "splits", "dt"],
 )
 def test_wrong_archives_are_refused(tmp_path, change, message):
     values = {name: value for name, value in (fields() | change).items() if value is not None}

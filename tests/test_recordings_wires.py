@@ -25,6 +25,8 @@ def test_wires_are_read_with_what_was_published(tmp_path):
     assert (white.name, black.name) == ("white", "black") and black.linear_density == 0.03
     assert white.keypoints.shape == (3, 11, 3) and white.length == pytest.approx(0.3 * np.pi)
     assert white.published_stiffness.tolist() == [1e-4, 2e-4, 3e-4]
+    np.savez(tmp_path / "wires.npz", **(fields() | {"length_m": np.array(1)}))
+    assert read_wires(tmp_path / "wires.npz")[0].length == 1.0
 
 
 @pytest.mark.parametrize(
@@ -33,6 +35,11 @@ def test_wires_are_read_with_what_was_published(tmp_path):
         ({"keypoints": None}, "lacks keypoints"),
         ({"keypoints": np.zeros((2, 11, 3))}, r"keypoints has shape \(2, 11, 3\)"),
         ({"keypoints": np.full((2, 3, 11, 3), np.nan)}, "has values that are not finite"),
+        (
+            {"mass_per_length_kg_m": np.array([0.02, -0.03])},
+            "mass_per_length_kg_m has the value -0.03, expected positive",
+        ),
+        ({"EI_published_Nm2": np.zeros((2, 3))}, "EI_published_Nm2 has the value 0, expected positive"),
         ({"wire": np.array(["white"])}, r"wire has shape \(1,\), expected \(2,\)"),
         ({"EI_published_Nm2": np.zeros((2, 5))}, r"EI_published_Nm2 has shape \(2, 5\), expected \(2, 3\)"),
         ({"length_m": np.float64(1500.0)}, "1.5 m if they are in mm"),

@@ -14,6 +14,7 @@ from cablejax.bounded import Result
 from cablejax.diagnose import explanation, verdict_json
 from cablejax.diagnose.diagnosis import ParameterEstimate
 from cablejax.diagnose.fit import evaluate, improve
+from cablejax.gaplog import episodes_of, stack_episodes
 from cablejax.log_geometry import setup_fault
 from cablejax.poses import poses_at
 from cablejax.report.diagnosis_page import write_diagnosis_page
@@ -322,6 +323,15 @@ def test_a_window_that_no_fit_sees_is_left_out():
     assert windows.episode.tolist() == [0, 2, 3] and len(windows.left_out) == 1
     evidence = SpatialCable(Rod(8, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows).evidence()
     assert evidence.count.min() > 0
+
+
+def test_too_few_samples_are_refused_before_anything_is_fitted():
+    log, said = cases.recording(), []
+    fields = ("time", "keypoints", "gripper_pose", "gripper_command", "hold")
+    few = [dataclasses.replace(e, **{f: getattr(e, f)[::14] for f in fields}) for e in episodes_of(log)]
+    with pytest.raises(ValueError, match="noise cannot be estimated: no keypoint is observed often enough"):
+        diagnose_space(stack_episodes(few, {**log.meta, "roll_observed": True}), progress=said.append)
+    assert not any("time steps" in text for text in said)
 
 
 def test_of_one_whole_window_the_short_ones_are_used_too():

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.limits import shown
 from cablejax.npz import read_npz
 from cablejax.recordings.assemble import Nominal, gap_log_from_takes
 from cablejax.recordings.frames import Frame
@@ -68,6 +69,10 @@ class DeformRecordings:
                     f"{self.name}: {field} has shape {getattr(self, field).shape}, expected ({shape[0]},): one per "
                     f"block."
                 )
+        if unknown := sorted(set(self.split.tolist()) - {"train", "eval", ""}):
+            raise ValueError(
+                f"{self.name}: split has {shown(unknown[0])}, expected train, eval, which is never fitted, or nothing."
+            )
 
 
 def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:

@@ -45,7 +45,8 @@ def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
     [W, R].
 
     Raises:
-        ValueError: something in the file is missing, not finite or does not fit together, or it is no such file.
+        ValueError: something in the file is missing, not finite, not positive or does not fit together, or it is no
+            such file.
         FileNotFoundError: there is none.
     """
     path = pathlib.Path(path)
@@ -59,8 +60,11 @@ def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
         if arrays[name].shape != shape:
             raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape} for these keypoints.")
     for name in _FIELDS[1:]:
-        if not np.issubdtype(arrays[name].dtype, np.floating) or not np.isfinite(arrays[name]).all():
+        if not np.isfinite(arrays[name]).all():
             raise ValueError(f"{path}: {name} has values that are not finite.")
+    for name in ("mass_per_length_kg_m", "EI_published_Nm2"):
+        if not (least := arrays[name].min(initial=np.inf)) > 0:
+            raise ValueError(f"{path}: {name} has the value {least:g}, expected positive numbers.")
     length = float(arrays["length_m"])
     require_metres(length, "m")
     return tuple(

@@ -90,11 +90,11 @@ def diagnose_space(
     changes = local_changes(log, windows.held)
     for change in changes:
         progress(change)
+    noise = noise_of(windows)
     found = identify(windows, stiffness, cable["bending_damping_s"], only=only, state=state, progress=progress)
     effects, edges = named_effects(found, density), found.cable.rod.n_edges
     named = [effect.name for effect in effects]
     before, (after, results) = found.cable.motion(explanation()), found.unseen(with_both_drags(named))
-    noise = noise_of(windows)
     lost, error, use = _simulated(after, windows)
     kept_windows = found.cable.on(windows.chosen(use))
     smallest = smallest_gap(noise, windows, own := own_error(kept_windows, before[use], noise))
