@@ -31,7 +31,7 @@ from cablejax.dataset.generate import (
     simulate,
 )
 from cablejax.dataset.opening import open_store
-from cablejax.dataset.schema import DatasetConfig, Randomisation, config_from_json, config_to_json
+from cablejax.dataset.schema import Block, DatasetConfig, Randomisation, config_from_json, config_to_json
 from cablejax.dataset.windows import read_trajectories
 from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect
 from cablejax.simulate import ThreadedEngine
@@ -391,6 +391,19 @@ def test_faults_are_distinguished(reference):
     middle = one.keypoints.copy()
     middle[:, 1] += np.float32(0.2)
     assert "stretched" in find_fault(TINY, dataclasses.replace(one, keypoints=middle))
+
+
+def test_ends_off_the_grippers_are_a_fault_of_small_cables_too():
+    """9 mm beside its grippers a cable of 5 cm is not held."""
+    cable = Cable(length=0.05, diameter=0.001)
+    config = dataclasses.replace(TINY, discretisation=dataclasses.replace(TINY.discretisation, cable=cable))
+    points = np.zeros((2, cable.n_keypoints, 2), np.float32)
+    points[..., 0] = 0.9 * cable.keypoint_arclength
+    pose = np.concatenate([points[:, [0, -1]], np.zeros((2, 2, 1), np.float32)], axis=-1)
+    one = Block(points, pose, np.zeros((1, 2, 3), np.float32), np.ones(3), np.zeros((), np.int32))
+    assert find_fault(config, one) is None
+    beside = dataclasses.replace(one, keypoints=points + np.float32([0.0, 0.009]))
+    assert "m from its gripper (allowed: 0.0005 m)" in (find_fault(config, beside) or "")
 
 
 @pytest.mark.slow

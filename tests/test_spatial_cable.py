@@ -55,6 +55,12 @@ def test_a_recording_that_was_not_fitted_has_what_all_share(cable):
     np.testing.assert_allclose(mean.own[:, 0], [0.3, 0.2, -1.0, 0.0])
 
 
+def test_moves_where_the_system_binds_no_process_to_cores(cable, monkeypatch):
+    usual = cable.motion(explanation())
+    monkeypatch.delattr("os.sched_getaffinity", raising=False)
+    np.testing.assert_array_equal(cable.motion(explanation()), usual)
+
+
 def test_derivatives_are_those_of_finite_differences(cable):
     trial, episodes = at(cable, (*_EFFECTS, "keypoint_bias"), seed=1), np.array([0, 3])
     ((here, slopes),) = cable.linearise([trial], episodes)

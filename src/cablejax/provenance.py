@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import importlib.metadata
-import os
 import platform
 from collections.abc import Sequence
 
 import cablejax
 from cablejax.compiled_programs import processor_lines
+from cablejax.cores import available_cores
 
 _PACKAGES = ("jax", "jaxlib", "flax", "mujoco", "mujoco-mjx", "optimistix", "numpy")
 
@@ -34,5 +34,4 @@ def machine() -> str:
     """The processor, the number of cores this process may use, and the system, in words."""
     named = (line.partition(":")[2].strip() for line in processor_lines() if line.startswith("model name"))
     model = next(named, platform.processor() or platform.machine())
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return f"{model}, {cores} cores, {platform.system()}"
+    return f"{model}, {available_cores()} cores, {platform.system()}"

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
-import os
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cores import available_cores
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.effects.given import with_effects
 from cablejax.effects.physics import Physics, nominal_physics
@@ -49,7 +49,7 @@ def draw(config: DatasetConfig, index: int, attempt: int = 0) -> Draw:
 
 def draw_all(config: DatasetConfig, indices: Sequence[int], attempt: int = 0) -> list[Draw]:
     """`draw` of some trajectories, on all cores."""
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+    with concurrent.futures.ThreadPoolExecutor(available_cores()) as pool:
         return list(pool.map(lambda index: draw(config, index, attempt), indices))
 
 

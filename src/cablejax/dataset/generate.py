@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from cablejax.cores import available_cores
 from cablejax.dataset.bucket import Bucket
 from cablejax.dataset.drawing import Draw, cable_params, draw_all
 from cablejax.dataset.opening import open_or_create
@@ -37,7 +38,8 @@ CABLES_ON_ACCELERATOR = 2048
 """Cables in a batch on each accelerator: beyond, its steps take longer as their number grows."""
 
 GRASP_TOLERANCE = 1e-2
-"""Largest distance of an end keypoint from its gripper [m]: a cable that snaps through pulls its ends off a bit."""
+"""Largest distance of an end keypoint from its gripper, in lengths of the cable: one that snaps through pulls its ends
+off a bit."""
 
 COMPRESSED = 0.9
 """Size of random motions in a store, relative to their arrays."""
@@ -195,7 +197,7 @@ def simulate(
     rows = np.concatenate([np.asarray(config.shard_rows(shard)) for shard in shards])
     out = {name: np.zeros((len(rows), *shape), dtype) for name, (shape, dtype) in config.array_shapes().items()}
     # one compiled program simulates whole shards; threads take any number of cables
-    at_once = len(rows) if isinstance(engine, DeviceParallel) else 2 * (os.cpu_count() or 1)
+    at_once = len(rows) if isinstance(engine, DeviceParallel) else 2 * available_cores()
     pending, problems = np.arange(len(rows)), {}
     for attempt in range(MAX_ATTEMPTS):
         problems = {}
@@ -237,8 +239,9 @@ def find_fault(config: DatasetConfig, one: Block) -> str | None:
     if "observation" in hooks:
         return None
     gap = np.linalg.norm(keypoints[:, [0, -1]] - grippers, axis=-1).max()
-    if gap > GRASP_TOLERANCE:
-        return f"an end of the cable is {gap:.2g} m from its gripper (allowed: {GRASP_TOLERANCE:.2g} m)"
+    allowed = GRASP_TOLERANCE * config.cable.length
+    if gap > allowed:
+        return f"an end of the cable is {gap:.2g} m from its gripper (allowed: {allowed:.2g} m)"
     if "extension" in hooks:
         return None
     spacing = np.diff(config.cable.keypoint_arclength)

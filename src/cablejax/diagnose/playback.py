@@ -6,7 +6,6 @@ import concurrent.futures
 import dataclasses
 import functools
 import math
-import os
 from collections.abc import Sequence
 
 import jax
@@ -15,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.cores import available_cores
 from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate.chain.replay import LARGEST_STEP, SETTLING, Chain
@@ -128,7 +128,7 @@ class Playback:
             points[rows[:, 0], rows[:, 1]] = np.asarray(result)[: len(rows)]
 
         touching, longest_first = stacked.obstacle_radius > 0, np.argsort(-length[chosen], kind="stable")
-        with concurrent.futures.ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        with concurrent.futures.ThreadPoolExecutor(available_cores()) as pool:
             tasks = []
             for with_contact in (False, True):
                 which = np.flatnonzero(touching == with_contact)

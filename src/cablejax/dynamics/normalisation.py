@@ -14,7 +14,8 @@ from cablejax.dynamics.graph import Frame, frame_of, prior_of
 from cablejax.types import History, Trajectory
 
 GRASP_TOLERANCE = 2e-2
-"""Largest distance of an end keypoint from its gripper [m] that is taken for a grasp: cables that snap through pull."""
+"""Largest distance of an end keypoint from its gripper that is taken for a grasp, in lengths of the cable: cables that
+snap through pull."""
 
 
 def check_trajectories(data: Trajectory, config: ModelConfig, *, steps: int, what: str) -> None:
@@ -51,7 +52,7 @@ def check_trajectories(data: Trajectory, config: ModelConfig, *, steps: int, wha
                 f"{int(np.argmax(bad))}). Drop or regenerate them."
             )
     gap = np.abs(np.asarray(data.keypoints)[:, :, [0, -1]] - np.asarray(data.gripper_pose)[..., :2]).max()
-    if gap > GRASP_TOLERANCE:
+    if gap > GRASP_TOLERANCE * config.length:
         raise ValueError(
             f"{what}: an end keypoint is {gap:.3g} m away from its gripper, expected to coincide. "
             "Keypoint 0 belongs to gripper 0 and the last to gripper 1."

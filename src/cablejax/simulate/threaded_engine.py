@@ -6,7 +6,6 @@ import concurrent.futures
 import copy
 import dataclasses
 import functools
-import os
 from typing import ClassVar
 
 import jax
@@ -15,6 +14,7 @@ import mujoco
 import numpy as np
 
 from cablejax.cable import Discretisation
+from cablejax.cores import available_cores
 from cablejax.effects.arms import executed_twist, follows_exactly
 from cablejax.effects.base import Hook
 from cablejax.effects.camera import seen_by_camera
@@ -73,7 +73,7 @@ class ThreadedEngine(Engine):
         keypoints = np.empty((size, samples, self.config.cable.n_keypoints, self.config.dimension))
         poses = np.empty((size, samples, *state.gripper_pose.shape[1:]))
         qpos, qvel = np.empty_like(state.qpos), np.empty_like(state.qvel)
-        workers = max(min(self.n_threads or os.cpu_count() or 1, size), 1)
+        workers = max(min(self.n_threads or available_cores(), size), 1)
 
         def run(worker: int) -> None:
             simulation = _Simulation(self.config, self.mj_model)

@@ -10,13 +10,13 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import functools
-import os
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from cablejax.cores import available_cores
 from cablejax.diagnose.belief import LEAST_SQUARES
 from cablejax.diagnose.evidence import Evidence, Robust
 from cablejax.diagnose.protocol import Explanation, Plan, Simulator
@@ -202,7 +202,7 @@ class SpatialCable(Simulator):
             found = run(values[full], *more, part.position, part.frames, part.keypoints[:, :2])
             return jax.tree.map(lambda a: np.asarray(a)[: len(index)], found)
 
-        with concurrent.futures.ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        with concurrent.futures.ThreadPoolExecutor(available_cores()) as pool:
             return list(pool.map(batch, range(0, len(windows), size)))
 
     def _values(self, one: Explanation, episodes) -> Float[np.ndarray, "e P"]:
