@@ -241,7 +241,7 @@ def test_a_closed_pipe_is_no_error(arguments):
 
 
 def test_the_bar_moves_before_a_shard_is_done(monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    monkeypatch.setattr(generation, "available_cores", lambda: 1)
     config = dataclasses.replace(stores.SMALL, engine="threaded")
     moved: list[int] = []
     generation.simulate(config, generation.make_engine(config), [0], moved.append)
