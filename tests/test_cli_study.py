@@ -82,6 +82,18 @@ def test_effects_that_act_together_are_no_alternatives():
     assert ended(twice, {"inseparable": False}, rounds_left=2) is None
 
 
+def test_the_page_of_a_study_without_a_gap_claims_no_cause_and_no_second_recording():
+    page = study_sheet([found("none")], [["U"]], "clear", ())
+    cards = {name: (value, note) for name, value, note in page.cards}
+    assert cards["Verdict"] == ("no gap", "") and cards["Error"] == ("5.0 mm", "nothing is named")
+    assert page.tables[0][2][0][3] == "5.0 mm" and page.following == ()
+    named = study_sheet([found("named")] * 2, [["U"], ["S"]], "clear", ())
+    assert dict((name, value) for name, value, _ in named.cards)["Error"] == "5.0 → 1.0 mm"
+    assert named.following[-1] == "What each recording added: round_2/report.html"
+    (axes, _) = named.figures[0][0].axes
+    assert axes.patches[0].get_width() == pytest.approx(90.0), "per cent, as the numbers beside the bars"
+
+
 def test_first_recording_goes_to_the_goals_and_back_in_the_middle_of_the_workspace():
     bounds = Bounds(workspace=((1.0, 1.0), (3.4, 3.4)), speed=0.03)
     log = first_recording(LONG, straight_start(LONG), GOALS, bounds)

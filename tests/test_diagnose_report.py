@@ -19,7 +19,7 @@ from cablejax.diagnose.verdict_json import verdict_json, write_verdict
 from cablejax.diagnose.where import localise
 from cablejax.effects import OUTSIDE
 from cablejax.gaplog import write_gap_log
-from cablejax.report.diagnosis_charts import ranking_figure
+from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import where_figure
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.diagnosis_sections import ranking_note
@@ -479,3 +479,21 @@ def test_the_figure_has_keypoints_and_times_where_they_are():
         assert time[0] == pytest.approx(50.0, abs=0.1) and (along[:-1] < marks).all() and (marks < along[1:]).all()
     texts = [text.get_text() for text in figure.axes[0].texts]
     assert "nan" not in " ".join(texts) and np.isnan(changed.where.along_cable_mm[4])
+
+
+@pytest.mark.parametrize("length", [0.3, 3.0])
+def test_a_point_of_the_cable_is_marked_as_broadly_on_every_cable(length):
+    made = diagnosis(effects=(MARKS,))
+    made.log.meta["keypoint_arclength_m"] = np.linspace(0.0, length, POINTS).tolist()
+    strip = where_figure(made).axes[0]
+    for line, index in zip(strip.lines, MARKS.parameters["index"].value, strict=True):
+        middle = index / (POINTS - 1)
+        np.testing.assert_allclose(line.get_xdata(), length * np.array([middle - 0.01, middle + 0.01]), rtol=1e-9)
+
+
+def test_errors_of_hundredths_of_a_millimetre_are_not_drawn_as_zero():
+    gap = dataclasses.replace(NO_GAP, noise_floor_mm=0.031, horizons_mm={1.0: (0.043, 0.043)}, ahead_mm={})
+    figure = shrinkage_figure(diagnosis("none", gap=gap))
+    assert {text.get_text() for text in figure.axes[0].texts} == {"0.04"}
+    (legend,) = figure.legends
+    assert "noise of the recording, 0.03 mm" in [text.get_text() for text in legend.get_texts()]

@@ -49,7 +49,7 @@ def test_place_and_episodes_of_a_gap():
     where = localise(*case(gap), np.full(POINTS, NOISE))
     assert np.flatnonzero(where.episode_p < LEVEL).tolist() == [1, 3]
     assert set(np.argsort(-where.along_cable_mm)[:3]) == {5, 6, 7}
-    assert "it shows in episodes 1 and 3 of 4 only" in where.sentences[0]
+    assert "it shows in only 2 of 4 episodes: episode 1 and episode 3." in where.sentences[0]
     assert "between 0.42 and 0.58 m" in where.sentences[1]
     assert where.horizons_mm[2.0] < 0.3 < 1.0 < where.horizons_mm[10.0]
 
@@ -200,7 +200,7 @@ def test_what_was_not_seen_and_what_repeats_is_no_episode_of_its_own():
     keypoints = log.keypoints.copy()
     keypoints[3] = np.nan
     where = localise(dataclasses.replace(log, keypoints=keypoints), nominal, np.full(POINTS, NOISE))
-    assert "it shows in episode 1 of 3 only" in where.sentences[0]
+    assert "it shows in only 1 of 3 episodes: episode 1." in where.sentences[0]
     again = dataclasses.replace(
         where,
         heat=np.concatenate([where.heat] * 2),

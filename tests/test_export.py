@@ -192,6 +192,19 @@ def test_rerun_reads_its_recordings_back(tmp_path):
     assert found["/about", "TextDocument:text"][1] == [["# About"]]
 
 
+@pytest.mark.parametrize("length", [0.3, 3.0])
+def test_rerun_draws_grippers_and_keypoints_in_proportion_to_the_cable(length, tmp_path):
+    needs("rerun")
+    from cablejax.report.rerun_file import write_rerun
+
+    log = planar()
+    log.meta["cable"]["length_m"] = length
+    found = rerun_rows(write_rerun(tmp_path / "run.rrd", log))
+    arrow = found["/0_approach_u/gripper_0", "Arrows3D:vectors"][1]
+    radius = found["/0_approach_u/keypoints", "Points3D:radii"][1]
+    assert np.ravel(arrow)[0] == pytest.approx(0.06 * length) and np.ravel(radius)[0] == pytest.approx(0.004 * length)
+
+
 def test_a_diagnosis_is_exported_with_what_it_simulated(tmp_path, capsys):
     needs("rerun")
     from cablejax.report.diagnosis_page import write_diagnosis_page

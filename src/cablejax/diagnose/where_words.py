@@ -63,8 +63,7 @@ def _size(where: Where, shown: list[int] | None, floor: float, names: Sequence[s
     if shown is not None and not shown:
         return f"{size}, too small to show in any single episode."
     if shown is not None and len(shown) < total:
-        numbers = listed([str(e) for e in shown])
-        return f"{size}; it shows in {'episode' if len(shown) == 1 else 'episodes'} {numbers} of {total} only."
+        return f"{size}; it shows in only {len(shown)} of {total} episodes: {listed([names[e] for e in shown])}."
     if total == 1:
         return f"{size}, in the one episode."
     worst = max(seen, key=lambda e: sizes[e])
@@ -74,7 +73,7 @@ def _size(where: Where, shown: list[int] | None, floor: float, names: Sequence[s
             f"{size}. It is largest in {names[worst]}, {_mm(sizes[worst])}; the median of the others is {_mm(others)}."
         )
     if sizes[worst] > 2.5 * others:
-        return f"{size}, in every episode but mostly in {names[worst]}: {sizes[worst]:.1f} mm."
+        return f"{size}, in every episode but mostly in {names[worst]}: {_mm(sizes[worst])}."
     return f"{size}, in every episode."
 
 
@@ -91,15 +90,15 @@ def _along(where: Where, arclength: np.ndarray) -> list[str]:
     peak = int(np.argmax(profile))
     if ends.min() > 0.5 * profile.max():
         return [
-            f"It reaches the grippers, {ends.min():.1f} mm at the smaller end against {profile.max():.1f} mm at most: "
+            f"It reaches the grippers, {_mm(ends.min())} at the smaller end against {_mm(profile.max())} at most: "
             "the camera's frame, the arms or the grasps are off, not only the cable between them."
         ]
     near = np.flatnonzero(profile >= 0.5 * profile.max())
     low, high = marks[near[0]], marks[near[-1]]
     outside = np.delete(profile, np.arange(near[0], near[-1] + 1))
-    rest = f" against {np.sqrt((outside**2).mean()):.1f} mm elsewhere" if len(outside) else ""
+    rest = f" against {_mm(np.sqrt((outside**2).mean()))} elsewhere" if len(outside) else ""
     place = f"between {low:.2f} and {high:.2f} m" if high > low else f"at {low:.2f} m"
-    sentence = f"Along the cable it is largest {place}, {profile[peak]:.1f} mm at {marks[peak]:.2f} m{rest}."
+    sentence = f"Along the cable it is largest {place}, {_mm(profile[peak])} at {marks[peak]:.2f} m{rest}."
     bend = where.bend_per_m
     if bend is not None and bend.max() > 0:
         strong = np.flatnonzero(bend >= 0.7 * bend.max())
@@ -120,10 +119,10 @@ def _when(where: Where) -> list[str]:
     if hold is not None and moving is not None:
         if "speed: hold" in known and known["speed: hold"][0] < 1 / _CLEAR_RATIO:
             sentences.append(
-                f"It grows with motion, {moving:.1f} mm against {hold:.1f} mm in holds: suspect a lag or drag."
+                f"It grows with motion, {_mm(moving)} against {_mm(hold)} in holds: suspect a lag or drag."
             )
         elif hold > 0.7 * moving and hold > 0:
-            sentences.append(f"It remains while the grippers rest, {hold:.1f} mm in holds: not a lag.")
+            sentences.append(f"It remains while the grippers rest, {_mm(hold)} in holds: not a lag.")
     if where.episode_p is None and slow is not None and fast is not None:
         sentences.append(f"It is {_mm(fast)} while the grippers move fast, {_mm(slow)} while they move slowly.")
     horizons = list(where.horizons_mm.items())
@@ -131,9 +130,9 @@ def _when(where: Where) -> list[str]:
         first, early = horizons[0]
         last, late = max(horizons, key=lambda item: item[1])
         if early > 0.7 * late:
-            sentences.append(f"It is there from the start, {early:.1f} mm within the first {first:g} s.")
+            sentences.append(f"It is there from the start, {_mm(early)} within the first {first:g} s.")
         elif late > 3 * max(early, 0.05):
-            sentences.append(f"It builds up: {early:.1f} mm in the first {first:g} s, {late:.1f} mm by {last:g} s.")
+            sentences.append(f"It builds up: {_mm(early)} in the first {first:g} s, {_mm(late)} by {last:g} s.")
     words = {
         "speed: fast": ("when the grippers move fast", "when the grippers move slowly"),
         "curvature: high": ("where the cable is strongly bent", "where the cable is nearly straight"),

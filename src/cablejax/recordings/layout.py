@@ -130,7 +130,7 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
     try:
         values = read_toml(path)
     except (ValueError, OSError) as error:
-        raise ValueError(f"This is not a layout: {error} The smallest is\n{SMALLEST[place]}") from None
+        raise ValueError(f"The layout could not be read. {error} The smallest layout is\n{SMALLEST[place]}") from None
     if unknown := set(values) - {"cable", "table", "frame", "source", place}:
         raise ValueError(
             f"{path} has the unknown tables {shown(sorted(unknown))}, expected [cable], [table], [frame], [source] "

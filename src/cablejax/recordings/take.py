@@ -96,8 +96,12 @@ def typical_spacing(takes: tuple[Take, ...]) -> Float[np.ndarray, " M"]:
     seen = np.isfinite(distances).any(axis=0)
     if not seen.all():
         index = int(np.argmin(seen))
+        known = [any(np.isfinite(take.keypoints[:, k]).any() for take in takes) for k in (index, index + 1)]
+        missing = [f"keypoint {index + k} was never observed" for k in (0, 1) if not known[k]]
         raise ValueError(
-            f"Keypoints {index} and {index + 1} are never observed together: leave out the keypoint that is missing."
+            f"Keypoints {index} and {index + 1} are never observed together"
+            f"{': ' + ', and '.join(missing) if missing else ''}. Leave out the keypoint that is missing. If it is at "
+            "a gripper whose pose was measured, write the gripper's position into the keypoint's columns instead."
         )
     return np.nanmedian(distances, axis=0)
 

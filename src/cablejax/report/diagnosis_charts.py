@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis
 from cablejax.diagnose.judgement import effect_title
-from cablejax.report.effect_words import explained_label
+from cablejax.report.effect_words import explained_label, millimetres, short
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 
 _MAX_RANKED = 8
@@ -88,7 +88,7 @@ def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
         _bars(ax, x - (wide / 2 if explained else 0), before, wide, believed, "nominal simulator")
         if explained:
             _bars(ax, x + wide / 2, after, wide, LIGHT.residual, explained_label(diagnosis))
-        noise = f"noise of the recording, {gap.noise_floor_mm:.1f} mm"
+        noise = f"noise of the recording, {millimetres(gap.noise_floor_mm)}"
         ax.axhline(gap.noise_floor_mm, color=LIGHT.ink, lw=1.2, ls=(0, (5, 3)), label=noise)
         longest = max((seconds for seconds, _ in horizons), default=0.0)
         ax.set_xticks(x, [f"first {seconds:g} s" if seconds < longest else "all" for seconds, _ in horizons])
@@ -108,7 +108,7 @@ def _bars(ax: Axes, x: np.ndarray, heights: np.ndarray, width: float, colour: An
     """Bars with their heights written on top."""
     ax.bar(x, heights, width, color=colour, label=label)
     for at, height in zip(x, heights, strict=True):
-        ax.text(at, height, f"{height:.1f}", ha="center", va="bottom", fontsize=9.5)
+        ax.text(at, height, short(height), ha="center", va="bottom", fontsize=9.5)
 
 
 def _ahead(ax: Axes, errors: dict[str, float], believed: str, label: str | None) -> None:

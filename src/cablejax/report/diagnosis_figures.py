@@ -16,7 +16,7 @@ from scipy.signal import convolve
 from cablejax.arrays import stretches
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
 from cablejax.diagnose.judgement import effect_title
-from cablejax.report.effect_words import explained_label
+from cablejax.report.effect_words import explained_label, millimetres, short
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, bar_of, cable_curve, draw_grippers
 
 # Transparent where there is no gap, so that it reads on a light and on a dark page.
@@ -27,6 +27,8 @@ _MAX_EPISODES = 12
 # Deviations of more than about a tenth of the picture show without being enlarged.
 _LARGEST_ZOOM = 0.12
 _SMOOTHING_S = 1.0
+# Half of the shortest section that is drawn [lengths of the cable].
+_MARK = 0.01
 
 
 def worst_moment(diagnosis: CableDiagnosis) -> tuple[int, int]:
@@ -118,7 +120,7 @@ def where_figure(diagnosis: CableDiagnosis) -> Figure:
             image = ax.pcolormesh(time, rows_at, values.T, cmap=_HEAT, vmin=0.0, vmax=top, rasterized=True)
             _mark_holds(ax, diagnosis, int(e), rows_at[-1])
             size = where.per_episode_mm[e]
-            ax.set_title(f"Episode {e}: {f'{size:.1f} mm' if np.isfinite(size) else 'not observed'}", fontsize=10)
+            ax.set_title(f"Episode {e}: {millimetres(size) if np.isfinite(size) else 'not observed'}", fontsize=10)
             ax.tick_params(labelleft=index % columns == 0)
             if index % columns == 0:
                 ax.set_ylabel("along\ncable [m]", fontsize=9)
@@ -166,10 +168,10 @@ def _strip(ax: Axes, diagnosis: CableDiagnosis, arclength: np.ndarray) -> None:
     )
     ax.add_patch(Rectangle((arclength[0], 0), arclength[-1] - arclength[0], 1, fill=False, ec=LIGHT.muted, lw=1))
     for s, value in zip(arclength[seen], profile[seen], strict=True):
-        ax.text(s, 1.12, f"{value:.1f}", ha="center", va="bottom", fontsize=9, color=LIGHT.muted)
+        ax.text(s, 1.12, short(value), ha="center", va="bottom", fontsize=9, color=LIGHT.muted)
     for effect in diagnosis.effects:
         for low, high in _sections(effect, arclength):
-            low, high = (low - 0.008, high + 0.008) if high - low < 0.016 else (low, high)
+            low, high = _wide_enough(low, high, arclength)
             ax.plot([low, high], [-0.22, -0.22], color=LIGHT.residual, lw=5, solid_capstyle="butt", clip_on=False)
             ax.text(
                 0.5 * (low + high),
@@ -208,13 +210,19 @@ def _draw_places(ax: Axes, diagnosis: CableDiagnosis, cable: np.ndarray) -> None
     for effect in diagnosis.effects:
         table = effect.location.get("table_m")
         for low, high in _sections(effect, arclength):
-            margin = max(0.0, 0.012 - 0.5 * (high - low))
-            part = curve[(s >= low - margin) & (s <= high + margin)]
+            low, high = _wide_enough(low, high, arclength)
+            part = curve[(s >= low) & (s <= high)]
             ax.plot(*part.T, color=LIGHT.residual, alpha=0.22, lw=17, solid_capstyle="butt")
         if table is not None:
             radius = effect.parameters.get("radius_m")
-            size = 0.02 if radius is None else float(radius.value)
+            size = 0.02 * (arclength[-1] - arclength[0]) if radius is None else float(radius.value)
             ax.add_patch(Circle(tuple(table), size, fc=LIGHT.residual, ec=LIGHT.residual, alpha=0.3, lw=1.5))
+
+
+def _wide_enough(low: float, high: float, arclength: np.ndarray) -> tuple[float, float]:
+    """A section about the same place, wide enough to be seen on this cable."""
+    half = max(0.5 * (high - low), _MARK * (arclength[-1] - arclength[0]))
+    return 0.5 * (low + high) - half, 0.5 * (low + high) + half
 
 
 def _sections(effect: NamedEffect, arclength: np.ndarray) -> list[tuple[float, float]]:

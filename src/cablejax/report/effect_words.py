@@ -119,16 +119,17 @@ def quantity(value: Any, unit: str, ci90: Any = None, *, interval: bool = True) 
 
 
 def millimetres(value: float) -> str:
-    """A length in millimetres to two digits, at least whole tenths below ten: "0.04 mm", "1.3 mm", "27 mm"."""
-    return f"{_short(value)} mm"
+    """A length in millimetres as `short` writes it: "0.04 mm", "1.3 mm", "27 mm"."""
+    return f"{short(value)} mm"
 
 
 def error_falls(gap: Gap) -> str:
     """The error before and after, as in "77 → 12 mm"."""
-    return f"{_short(gap.before_rmse_mm)} → {millimetres(gap.after_rmse_mm)}"
+    return f"{short(gap.before_rmse_mm)} → {millimetres(gap.after_rmse_mm)}"
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
+    """A number to two digits, at least whole tenths below ten: "0.04", "1.3", "27"."""
     if abs(value) >= 9.95:
         return f"{value:.0f}"
     return f"{value:.1f}" if abs(value) >= 0.095 or value == 0 else f"{value:.2f}"

@@ -15,7 +15,7 @@ from cablejax.diagnose.diagnosis import NextMotion
 from cablejax.diagnose.judgement import effect_title
 from cablejax.report.animation import DPI, animate
 from cablejax.report.effect_words import explanation_title
-from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, draw_grippers
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, draw_grippers, draw_scale_bar
 
 _COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")
 _MOMENTS = 5
@@ -51,6 +51,7 @@ def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> Non
         figure = Figure(figsize=(width, height), dpi=DPI)
         ax = figure.add_axes((0.0, 0.0, 1.0, 1.0 - header / height), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         ax.set_axis_off()
+        draw_scale_bar(ax, (low[0], high[0], low[1], high[1]), length)
         figure.text(0.02, 1.0 - 0.1 / height, "Record next", size=12, weight="bold", va="top")
         clock = figure.text(0.98, 1.0 - 0.1 / height, "", size=12, weight="bold", ha="right", va="top")
         for row, (name, colour) in enumerate(zip(names, _COLOURS, strict=False)):
@@ -79,6 +80,7 @@ def _film(figure: Any, following: NextMotion) -> None:
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
         ax.spines[:].set_visible(False)
         ax.set_title(f"{following.interval * sample:.0f} s", fontsize=10)
+    draw_scale_bar(figure.axes[-1], (low[0], high[0], low[1], high[1]), length)
     if len(following.shapes) > 1:
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=5, fontsize=10)
 

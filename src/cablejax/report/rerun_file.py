@@ -33,7 +33,8 @@ from cablejax.whole_file import whole_file
 TIMELINE = "time"
 """Name of the timeline."""
 
-_ARROW = 0.06  # [m]
+# Length of an arrow and radius of a keypoint [lengths of the cable].
+_ARROW, _RADIUS = 0.06, 0.004
 _MOST_PANES = 9
 _COLOURS = {"nominal": LIGHT.direct, "explained": LIGHT.residual}
 
@@ -62,7 +63,7 @@ def write_rerun(
     names = [f"{e}_{re.sub(r'[^A-Za-z0-9_]+', '_', motion)[:40]}" for e, motion in enumerate(log.meta["motion"])]
     episodes = dict(zip(names, episodes_of(log), strict=True))
     for (name, episode), target in zip(episodes.items(), targets_of(log), strict=True):
-        _write_observed(rr, recording, name, episode)
+        _write_observed(rr, recording, name, episode, log.meta["cable"]["length_m"])
         if target is not None:
             line = rr.LineStrips3D([points_in_space(target)], colors=_rgb(LIGHT.target))
             recording.log(f"{name}/target", line, static=True)
@@ -81,20 +82,22 @@ def write_rerun(
     return path
 
 
-def _write_observed(rr: Any, recording: Any, name: str, episode: Episode) -> None:
+def _write_observed(rr: Any, recording: Any, name: str, episode: Episode, length: float) -> None:
+    """Keypoints and grippers, drawn in proportion to the cable's length [m]."""
     clock = _clock(rr, episode.time)
     points = points_in_space(episode.keypoints)
     seen = np.isfinite(points).all(axis=-1)
     recording.send_columns(
         f"{name}/keypoints", [clock], rr.Points3D.columns(positions=points[seen]).partition(seen.sum(axis=1).tolist())
     )
-    recording.log(f"{name}/keypoints", rr.Points3D.from_fields(colors=_rgb(LIGHT.ink), radii=0.004), static=True)
+    dots = rr.Points3D.from_fields(colors=_rgb(LIGHT.ink), radii=_RADIUS * length)
+    recording.log(f"{name}/keypoints", dots, static=True)
     _write_lines(rr, recording, f"{name}/cable", episode.time, episode.keypoints, LIGHT.ink)
     pose = pose_in_space(episode.gripper_pose)
     for q in range(pose.shape[1]):
         columns = rr.Transform3D.columns(translation=pose[:, q, :3], quaternion=np.roll(pose[:, q, 3:], -1, axis=-1))
         recording.send_columns(f"{name}/gripper_{q}", [clock], columns)
-        arrow = rr.Arrows3D(vectors=[[_ARROW, 0.0, 0.0]], colors=_rgb(LIGHT.gripper))
+        arrow = rr.Arrows3D(vectors=[[_ARROW * length, 0.0, 0.0]], colors=_rgb(LIGHT.gripper))
         recording.log(f"{name}/gripper_{q}", arrow, static=True)
 
 

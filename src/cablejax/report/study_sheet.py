@@ -13,7 +13,7 @@ from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.judgement import effect_title, listed, share
 from cablejax.diagnose.study import ENDED, Ended, alternatives
 from cablejax.effects.given import GivenEffect
-from cablejax.report.effect_words import error_falls
+from cablejax.report.effect_words import error_falls, millimetres
 from cablejax.report.sheet import Sheet
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 
@@ -39,6 +39,7 @@ def study_sheet(
         staged: effects of the plant.
     """
     last, rounds = found[-1], len(found)
+    none = last.verdict == "none"
     names = _causes(last)
     ranked = any(chance is not None for one in found for chance in _chances(one).values())
     pictures = [(_beliefs(found), "Probability of each cause after each round, given all recordings so far.")]
@@ -47,9 +48,9 @@ def study_sheet(
         title=f"After {rounds} recording{'s' if rounds > 1 else ''}: {names}",
         lead=f"{ENDED[why]} {last.sentence}",
         cards=[
-            ("Verdict", _VERDICTS[last.verdict] if why != "clear" or last.verdict == "none" else "named", names),
+            ("Verdict", _VERDICTS[last.verdict] if why != "clear" or none else "named", "" if none else names),
             ("Recorded", f"{sum(map(len, motions))} motions", f"in {rounds} round{'s' if rounds > 1 else ''}"),
-            ("Error", error_falls(last.gap), "without and with what is named"),
+            ("Error", _error(last), "without and with what is named" if last.effects else "nothing is named"),
             (
                 "Staged in the plant",
                 listed([effect_title(effect.name) for effect in staged]) or "nothing",
@@ -73,7 +74,7 @@ def study_sheet(
                 if last.effects
                 else []
             ),
-            f"What each recording added: round_{rounds}/report.html",
+            *([f"What each recording added: round_{rounds}/report.html"] if rounds > 1 else []),
         ),
         facts={"time of the diagnoses": f"{sum(one.seconds for one in found):.0f} s"},
     )
@@ -84,9 +85,14 @@ def _row(number: int, found: Diagnosis, motions: Sequence[str]) -> tuple[str, ..
         str(number),
         listed([name.replace("_", " ") for name in motions]),
         _causes(found),
-        error_falls(found.gap),
+        _error(found),
         Markup('<a href="round_{}/report.html">diagnosis</a>').format(number),
     )
+
+
+def _error(found: Diagnosis) -> str:
+    """The error without and with what is named; one number where nothing is."""
+    return error_falls(found.gap) if found.effects else millimetres(found.gap.before_rmse_mm)
 
 
 def _causes(found: Diagnosis) -> str:
@@ -119,11 +125,11 @@ def _beliefs(found: Sequence[Diagnosis]) -> Figure:
         axes = np.atleast_1d(figure.subplots(len(found), 1, sharex=True))
         for number, (ax, chance) in enumerate(zip(axes, chances, strict=True), 1):
             values = [chance.get(name, 0.0) for name in names]
-            ax.barh(range(len(names)), values, color=LIGHT.residual, height=0.65)
+            ax.barh(range(len(names)), [100.0 * value for value in values], color=LIGHT.residual, height=0.65)
             for y, value in enumerate(values):
-                ax.text(value + 0.01, y, share(value), va="center", color=LIGHT.muted)
+                ax.text(100.0 * value + 1.0, y, share(value), va="center", color=LIGHT.muted)
             ax.set_yticks(range(len(names)), [effect_title(name) for name in names])
             ax.invert_yaxis()
-            ax.set(xlim=(0.0, 1.12), title=f"after round {number}")
-        axes[-1].set_xlabel("probability, if the cause is one of those tried")
+            ax.set(xlim=(0.0, 112.0), title=f"after round {number}")
+        axes[-1].set_xlabel("probability, if the cause is one of those tried [%]")
     return figure
