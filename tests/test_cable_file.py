@@ -151,7 +151,7 @@ def test_weights_without_a_cable_say_so(tmp_path):
 def test_the_command_writes_the_reference_and_does_not_overwrite(tmp_path, capsys):
     out = tmp_path / "new" / "cable.toml"
     assert main(["cable", "--out", str(out)]) == 0
-    assert out.read_text() == cable_text(Cable())
+    assert out.read_text() == cable_text(Cable()) and "or keypoint_arclength_m = [0.0, ...] instead" in out.read_text()
     assert main(["cable", "--out", str(out)]) == 2
     assert "exists" in capsys.readouterr().err
     write_cable(out, OTHER)

@@ -12,9 +12,12 @@ import pytest
 from PIL import Image
 
 import spatial_cases
+from cablejax.cable import Cable, Discretisation
 from cablejax.commands.cable import find_cable
+from cablejax.control.targets import straight_start
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
 from cablejax.diagnose.judgement import verdict_sentence
+from cablejax.diagnose.safe_motions import safe_motions
 from cablejax.diagnose.verdict_json import verdict_json, write_verdict
 from cablejax.diagnose.where import localise
 from cablejax.effects import OUTSIDE
@@ -23,7 +26,7 @@ from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import where_figure
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.diagnosis_sections import ranking_note
-from cablejax.report.effect_words import effect_place, quantity, share
+from cablejax.report.effect_words import effect_place, instruction, quantity, share
 from cablejax.report.spatial_figures import recording_ends
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
@@ -497,3 +500,13 @@ def test_errors_of_hundredths_of_a_millimetre_are_not_drawn_as_zero():
     assert {text.get_text() for text in figure.axes[0].texts} == {"0.04"}
     (legend,) = figure.legends
     assert "noise of the recording, 0.03 mm" in [text.get_text() for text in legend.get_texts()]
+
+
+def test_a_motion_that_a_long_cable_does_not_end_in_time_is_said_to_be_cut():
+    ends = {}
+    for length in (1.0, 3.0):
+        cable = Cable(length=length)
+        pose = safe_motions(Discretisation(cable), straight_start(cable))["translation"]
+        ends[length] = instruction(dataclasses.replace(following("translation", (), 0.6), poses=pose))
+    assert ends[1.0].endswith("hold, and go back.")
+    assert ends[3.0] == f"{ends[1.0]} At the speed that is allowed, the first 30 s of it were judged; it takes longer."

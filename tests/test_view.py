@@ -17,6 +17,7 @@ from cablejax.dataset.schema import DatasetConfig
 from cablejax.diagnose.verdict_json import read_verdict, verdict_json, write_verdict
 from cablejax.dynamics.weights import FILE_NAME
 from cablejax.gaplog import TARGETS, targets_of, write_gap_log
+from cablejax.report.log_sheet import log_sheet
 from cli_cases import small_model
 from test_dataset_store import SMALL, block
 from test_diagnose_report import CURVED, diagnosis
@@ -54,6 +55,14 @@ def test_a_log(log, said, tmp_path, capsys):
     assert not re.search(r'(src|href)="(?!#|data:)', page) and page.count("<svg") == 2
     assert "exists" in refused(capsys, path)
     view(capsys, path, "--overwrite")
+
+
+def test_episodes_without_a_name_of_their_own_are_numbered_in_the_figures():
+    log = dataclasses.replace(planar(), meta={**planar().meta, "motion": ["recorded"] * 2})
+    (shapes, said), (course, _) = log_sheet(log, "log.npz").figures
+    assert [ax.get_title("left") for ax in shapes.axes if ax.get_visible()] == ["0: recorded", "1: recorded"]
+    assert [text.get_text() for text in course.legends[0].get_texts()] == ["0: recorded", "1: recorded"]
+    assert "target" in said and "target" not in "".join(words for _, words in log_sheet(in_space(), "log.npz").figures)
 
 
 def test_the_noise_of_a_log_is_estimated(tmp_path, capsys):

@@ -85,7 +85,8 @@ def cable_text(cable: Cable) -> str:
         for key, (name, what) in NUMBERS.items()
     ]
     if cable.marks is None:
-        lines.append((f"keypoints = {cable.n_keypoints}", "observed points, evenly spaced, both ends included"))
+        what = "observed points, evenly spaced, both ends included; or keypoint_arclength_m = [0.0, ...] instead"
+        lines.append((f"keypoints = {cable.n_keypoints}", what))
     else:
         marks = ", ".join(repr(float(s)) for s in cable.marks)
         lines.append((f"keypoint_arclength_m = [{marks}]", "observed points, from gripper 0 [m]"))

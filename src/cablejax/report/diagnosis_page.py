@@ -19,11 +19,11 @@ from cablejax.report import diagnosis_sections as sections
 from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import cable_figure, where_figure
 from cablejax.report.effect_words import (
-    MOTIONS,
     between,
     effect_place,
     error_falls,
     explained_label,
+    instruction,
     millimetres,
     parameter_title,
     quantity,
@@ -146,7 +146,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         far=sections.how_far(diagnosis),
         following=following,
         nothing_next=sections.nothing_next(diagnosis),
-        instruction="" if following is None else MOTIONS[following.motion],
+        instruction="" if following is None else instruction(following),
         tables=sections.detail_tables(diagnosis),
         record=sections.record(diagnosis),
     )

@@ -6,10 +6,14 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect
+import numpy as np
+
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, NextMotion
 from cablejax.diagnose.judgement import effect_title, listed, share
 
 _DECIMALS = 6
+# Grippers that move by less than this in a sample rest [m, rad].
+_AT_REST = 1e-9
 
 EFFECTS: dict[str, str] = {
     "bending_stiffness": "the bending stiffness differs everywhere by one factor",
@@ -82,6 +86,14 @@ MOTIONS: dict[str, str] = {
     "shifted_repeat": "Close in and go back; repeat it shifted across the table by 20 % of the cable's length.",
 }
 """Instruction for each motion of `cablejax.diagnose.safe_motions`, and for a designed one."""
+
+
+def instruction(following: NextMotion) -> str:
+    """What to do with the grippers; says so where the motion that was judged is cut off, as that of a long cable is."""
+    text, seconds = MOTIONS[following.motion], following.interval * (len(following.poses) - 1)
+    if following.motion == "designed" or np.ptp(following.poses[-2:], axis=0).max() < _AT_REST:
+        return text
+    return f"{text} At the speed that is allowed, the first {seconds:.0f} s of it were judged; it takes longer."
 
 
 def explanation_title(names: str) -> str:

@@ -38,6 +38,8 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
     file = shlex.quote(name)
     # a few episodes, evenly over the log
     chosen = np.unique(np.linspace(0, len(episodes) - 1, min(len(episodes), _SHOWN)).round().astype(int)).tolist()
+    drawn = [(dataclasses.replace(episodes[e], motion=f"{e}: {episodes[e].motion}"), targets[e]) for e in chosen]
+    stated = any(target is not None for target in targets)
     which = "" if len(chosen) == len(episodes) else f" {len(chosen)} of {len(episodes)} episodes."
     ranges = ", ".join(f"{axis} {span(points[..., k])}" for k, axis in enumerate("xyz"[: points.shape[-1]]))
     return Sheet(
@@ -53,8 +55,8 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
             *cable_cards(cable, on_table=planar),
         ],
         figures=[
-            (_shapes_figure([(episodes[e], targets[e]) for e in chosen]), _SHAPES + which),
-            (_time_figure([(episodes[e], targets[e]) for e in chosen]), _COURSE + which),
+            (_shapes_figure(drawn), _SHAPES + (_TARGET if stated else "") + which),
+            (_time_figure(drawn), (_COURSE_TO_TARGET if stated else _COURSE) + which),
         ],
         tables=[_table(episodes, targets)],
         following=(
@@ -71,11 +73,10 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
     )
 
 
-_SHAPES = (
-    "The cable at the start (light), in between, and at the end (blue); dots are keypoints, the broad grey line is the "
-    "target where the log states one."
-)
-_COURSE = "Speed of the faster gripper, and distance of the keypoints to the target where the log states one."
+_SHAPES = "The cable at the start (light), in between, and at the end (blue); dots are keypoints."
+_TARGET = " The broad grey line is the target where the log states one."
+_COURSE = "Speed of the faster gripper."
+_COURSE_TO_TARGET = "Speed of the faster gripper, and distance of the keypoints to the target where the log states one."
 
 
 def _noise(log: GapLog) -> tuple[str, str]:
