@@ -27,6 +27,7 @@ from cablejax.report.diagnosis_figures import where_figure
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.diagnosis_sections import ranking_note
 from cablejax.report.effect_words import effect_place, instruction, quantity, share
+from cablejax.report.motion_figures import motion_figure
 from cablejax.report.spatial_figures import recording_ends
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
@@ -510,3 +511,11 @@ def test_a_motion_that_a_long_cable_does_not_end_in_time_is_said_to_be_cut():
         ends[length] = instruction(dataclasses.replace(following("translation", (), 0.6), poses=pose))
     assert ends[1.0].endswith("hold, and go back.")
     assert ends[3.0] == f"{ends[1.0]} At the speed that is allowed, the first 30 s of it were judged; it takes longer."
+
+
+@pytest.mark.parametrize(("length", "bar"), [(0.3, "5 cm"), (3.0, "50 cm")])
+def test_the_motion_to_record_next_has_a_scale_bar_of_the_cables_size(length, bar):
+    made = following("mirror", (), 0.6)
+    pose, shapes = made.poses * [length, length, 1.0], {k: length * p for k, p in made.shapes.items()}
+    figure = motion_figure(dataclasses.replace(made, poses=pose, shapes=shapes))
+    assert figure is not None and bar in [text.get_text() for ax in figure.axes for text in ax.texts]
