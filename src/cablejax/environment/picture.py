@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from cablejax.report.style import FIGURE_STYLE, LIGHT, cable_curve, draw_grippers
+from cablejax.report.style import FIGURE_STYLE, LIGHT, draw_held_cable, draw_target
 
 PIXELS = 480
 """Width and height of a picture."""
@@ -36,10 +36,8 @@ def picture(
         figure = Figure(figsize=(PIXELS / _DPI, PIXELS / _DPI), dpi=_DPI)
         ax = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(-half, half), ylim=(-half, half))
         ax.set_axis_off()
-        ax.plot(*cable_curve(target).T, color=LIGHT.target, lw=2.2, ls=(0, (2.4, 1.7)))
-        draw_grippers(ax, gripper_pose, length)
-        ax.plot(*cable_curve(keypoints).T, color=LIGHT.residual, lw=2.2, solid_capstyle="round")
-        ax.plot(*keypoints.T, color=LIGHT.residual, ls="", marker="o", ms=3.4)
+        draw_target(ax, target)
+        draw_held_cable(ax, keypoints, gripper_pose, length, LIGHT.residual)
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()

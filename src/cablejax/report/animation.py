@@ -18,11 +18,11 @@ from cablejax.report.style import (
     LIGHT,
     METHOD_LABEL,
     by_shape,
-    cable_curve,
     common_window,
-    draw_grippers,
+    draw_held_cable,
     draw_scale_bar,
-    drawn_size,
+    draw_target,
+    size_of,
 )
 from cablejax.whole_file import whole_file
 
@@ -53,7 +53,7 @@ def write_gif(path: str | os.PathLike[str], runs: Runs, *, width: int = 960, fra
     Raises:
         ValueError: if there is no run.
     """
-    pairs, views = by_shape(runs), common_window(runs, margin=0.1)
+    pairs, views, length = by_shape(runs), common_window(runs, margin=0.1), size_of(runs)
     end = max(float(r.times[-1]) for r in runs.values())
     # The cable moves most at the start, so time runs slower there: frame times grow with the square.
     instants = end * np.linspace(0.0, 1.0, max(2, round(end / _SPEED * frames_per_second))) ** 2
@@ -70,12 +70,12 @@ def write_gif(path: str | os.PathLike[str], runs: Runs, *, width: int = 960, fra
             _still(ax, shape, panel, views[shape])
         drawn = axes[-1].lines[:1]
         figure.legend(drawn, ["target"], loc="center left", bbox_to_anchor=(300 / width, top), labelcolor=LIGHT.muted)
-        draw_scale_bar(axes[-1], views[list(pairs)[-1]], drawn_size(runs))
+        draw_scale_bar(axes[-1], views[list(pairs)[-1]], length)
 
         def draw(time: float) -> list[Any]:
             clock.set_text(f"{time:.0f} s")
             panels = zip(axes, pairs.values(), strict=True)
-            return [artist for ax, panel in panels for artist in _moving(ax, panel, time, drawn_size(runs))]
+            return [artist for ax, panel in panels for artist in _moving(ax, panel, time, length)]
 
         animate(path, figure, draw, instants, frames_per_second=frames_per_second, hold_s=_HOLD_S)
 
@@ -121,20 +121,17 @@ def _still(ax: Any, shape: str, runs: dict[Method, ClosedLoopRun], view: tuple[f
     ax.set(xlim=view[:2], ylim=view[2:], aspect="equal")
     ax.set_axis_off()
     ax.text(0.05, 1.0, shape, size=15, weight="bold", transform=ax.transAxes, parse_math=False)
-    target = cable_curve(next(iter(runs.values())).target.keypoints, n_points=400)
-    ax.plot(*target.T, color=LIGHT.target, lw=2.2, ls=(0, (2.4, 1.7)))
+    draw_target(ax, next(iter(runs.values())).target.keypoints, n_points=400)
 
 
 def _moving(ax: Any, runs: dict[Method, ClosedLoopRun], time: float, length: float) -> list[Any]:
     """Draws the runs of a panel at one instant [s]; between samples the cable is interpolated."""
     artists: list[Any] = []
     for method, run in runs.items():
-        colour = LIGHT.method(method)
         strong = method == "residual" or len(runs) == 1
         pose, keypoints = _at(run.times, run.gripper_pose, time), _at(run.times, run.keypoints, time)
-        artists += draw_grippers(ax, pose, length, color=LIGHT.gripper if strong else _GHOST)
-        artists += ax.plot(*cable_curve(keypoints, pose).T, color=colour, lw=2.2, solid_capstyle="round")
-        artists += ax.plot(*keypoints.T, color=colour, ls="", marker="o", ms=3.4)
+        gripper = LIGHT.gripper if strong else _GHOST
+        artists += draw_held_cable(ax, keypoints, pose, length, LIGHT.method(method), gripper)
     for row, (method, run) in enumerate(reversed(runs.items())):
         error = float(_at(run.times, run.error_cm, time))
         place = {

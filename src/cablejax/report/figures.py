@@ -24,7 +24,7 @@ from cablejax.report.style import (
     common_window,
     draw_grippers,
     draw_scale_bar,
-    drawn_size,
+    size_of,
 )
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def final_shapes(runs: Runs) -> Figure:
             target = next(iter(pair.values())).target.keypoints
             ax.plot(*cable_curve(target).T, color=LIGHT.target, lw=7, alpha=0.45, solid_capstyle="round")
             for method, run in pair.items():
-                _draw_cable(ax, run, -1, method, drawn_size(runs))
+                _draw_cable(ax, run, -1, method, size_of(runs))
             ax.set_title(shape, fontsize=14)
             for row, (method, run) in enumerate(reversed(pair.items())):
                 words = f"{run.terminal_error_cm:.2f} cm {METHOD_LABEL[method]}"
@@ -68,7 +68,7 @@ def final_shapes(runs: Runs) -> Figure:
                     words, (0.0, 0.0), xycoords="axes fraction", xytext=(0.0, -4.0 - 15.0 * row),
                     textcoords="offset points", color=LIGHT.method(method), va="top", fontsize=10.5,
                 )  # fmt: skip
-        draw_scale_bar(axes[-1], views[next(reversed(views))], drawn_size(runs))
+        draw_scale_bar(axes[-1], views[next(reversed(views))], size_of(runs))
         _method_legend(figure, runs, Line2D([], [], color=LIGHT.target, lw=7, alpha=0.45, label="target"))
     return figure
 
@@ -153,7 +153,7 @@ def snapshots(runs: Runs) -> Figure:
     last = len(run.times) - 1
     chosen = np.unique(np.round(last * np.linspace(0.0, 1.0, 5) ** 1.6).astype(int))
     only: Runs = {(shape, "residual"): run}
-    view, length = common_window(only)[shape], drawn_size(only)
+    view, length = common_window(only)[shape], size_of(only)
     width = 2.3
     with matplotlib.rc_context(_STYLE):
         height = width * (view[3] - view[2]) / (view[1] - view[0])

@@ -15,7 +15,7 @@ from cablejax.diagnose.diagnosis import NextMotion
 from cablejax.diagnose.judgement import effect_title
 from cablejax.report.animation import DPI, animate
 from cablejax.report.effect_words import explanation_title
-from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, draw_grippers, draw_scale_bar
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, draw_grippers, draw_scale_bar, drawn_size
 
 _COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")
 _MOMENTS = 5
@@ -42,7 +42,7 @@ def motion_figure(following: NextMotion | None) -> Figure | None:
 
 def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> None:
     """Writes a preview of the motion, five times as fast."""
-    (low, high), length = _window(following), _length(following)
+    (low, high), length = _window(following), _size(following)
     names, width = list(following.shapes), _WIDTH / DPI
     header = (_HEADER + _LINE * len(names)) / DPI
     height = header + max(width * (high[1] - low[1]) / (high[0] - low[0]), 0.01)
@@ -70,7 +70,7 @@ def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> Non
 
 
 def _film(figure: Any, following: NextMotion) -> None:
-    moments, (low, high), length = telling_moments(following), _window(following), _length(following)
+    moments, (low, high), length = telling_moments(following), _window(following), _size(following)
     for ax, sample in zip(figure.subplots(1, len(moments), squeeze=False)[0], moments, strict=True):
         for gripper in range(2):
             ax.plot(*following.poses[:, gripper, :2].T, color=LIGHT.faint, lw=1.5)
@@ -124,10 +124,9 @@ def _window(following: NextMotion) -> tuple[Float[np.ndarray, "2"], Float[np.nda
     every = np.concatenate(
         [following.poses[..., :2].reshape(-1, 2), *(p.reshape(-1, 2) for p in following.shapes.values())]
     )
-    margin = _MARGIN * _length(following)
+    margin = _MARGIN * _size(following)
     return np.nanmin(every, axis=0) - margin, np.nanmax(every, axis=0) + margin
 
 
-def _length(following: NextMotion) -> float:
-    """Of the cable [m], to two digits."""
-    return float(f"{length_through(next(iter(following.shapes.values()))[0]):.2g}")
+def _size(following: NextMotion) -> float:
+    return drawn_size(length_through(next(iter(following.shapes.values()))[0]))

@@ -25,8 +25,8 @@ from cablejax.report.style import (
     by_shape,
     cable_curve,
     common_window,
-    drawn_size,
     gripper_outline,
+    size_of,
 )
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def animation_data(runs: Runs) -> dict[str, Any]:
             "curve": [integers(cable_curve(x, g, 49)) for x, g in zip(run.keypoints, run.gripper_pose, strict=True)],
         }
 
-    pairs, length = by_shape(runs), drawn_size(runs)
+    pairs, length = by_shape(runs), size_of(runs)
     return {
         "end": max(float(r.times[-1]) for r in runs.values()),
         "view": common_window(runs, margin=0.1),

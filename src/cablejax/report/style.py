@@ -109,9 +109,14 @@ def cable_curve(
     return CubicSpline(distance, points, bc_type=ends)(np.linspace(0.0, distance[-1], n_points))
 
 
-def drawn_size(runs: Runs) -> float:
-    """Length of the longest cable of the runs [m], to two digits: what grippers, margins and scale bars go by."""
-    return float(f"{max(run.target.length for run in runs.values()):.2g}")
+def drawn_size(length: float) -> float:
+    """A cable's length [m] to two digits: what grippers, margins and scale bars go by."""
+    return float(f"{length:.2g}")
+
+
+def size_of(runs: Runs) -> float:
+    """`drawn_size` of the longest cable of the runs [m]."""
+    return drawn_size(max(run.target.length for run in runs.values()))
 
 
 def common_window(
@@ -132,7 +137,7 @@ def common_window(
         if shape in boxes:
             low, high = np.minimum(low, boxes[shape][0]), np.maximum(high, boxes[shape][1])
         boxes[shape] = low, high
-    width, height = np.max([high - low for low, high in boxes.values()], axis=0) + 2 * margin * drawn_size(runs)
+    width, height = np.max([high - low for low, high in boxes.values()], axis=0) + 2 * margin * size_of(runs)
     half = 0.5 * np.array([width, height])
     views = {}
     for shape, (low, high) in boxes.items():
@@ -171,6 +176,25 @@ def draw_grippers(ax: Any, pose: Float[np.ndarray, "2 3"], length: float, **look
     """Draws both grippers of a cable of this length at their poses [m, rad] and returns the patches."""
     outlines = [polygon for end in range(2) for polygon in gripper_outline(pose[end], end, length)]
     return [patch for polygon in outlines for patch in ax.fill(*polygon.T, lw=0, **{"color": LIGHT.gripper, **look})]
+
+
+def draw_target(ax: Any, keypoints: Float[np.ndarray, "N 2"], n_points: int = 61) -> None:
+    """A target [m], dashed."""
+    ax.plot(*cable_curve(keypoints, n_points=n_points).T, color=LIGHT.target, lw=2.2, ls=(0, (2.4, 1.7)))
+
+
+def draw_held_cable(
+    ax: Any,
+    keypoints: Float[np.ndarray, "N 2"],
+    pose: Float[np.ndarray, "2 3"],
+    length: float,
+    colour: str,
+    gripper: str = LIGHT.gripper,
+) -> list[Any]:
+    """Both grippers and the cable between them [m], with its keypoints; returns the artists."""
+    artists = draw_grippers(ax, pose, length, color=gripper)
+    artists += ax.plot(*cable_curve(keypoints, pose).T, color=colour, lw=2.2, solid_capstyle="round")
+    return artists + ax.plot(*keypoints.T, color=colour, ls="", marker="o", ms=3.4)
 
 
 def bar_of(length: float) -> tuple[float, str]:
