@@ -144,7 +144,16 @@ def test_bench_mpc_times_the_control_call(weights, capsys):
     assert result["batched"]["2"]["plans_per_second"] == pytest.approx(2e3 / result["batched"]["2"]["ms"])
 
 
-@pytest.mark.parametrize("wrong", [["--repeats", "0"], ["--batches", "0"], ["--horizon", "-1"], ["--solvers"]])
-def test_bench_mpc_refuses_what_cannot_be_timed(wrong, capsys):
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (["--repeats", "0"], "--repeats is 0"),
+        (["--batches", "2", "0"], "--batches is 0"),
+        (["--horizon", "-1"], "--horizon is -1"),
+        (["--solvers"], "expected at least one solver"),
+    ],
+    ids=str,
+)
+def test_bench_mpc_refuses_what_cannot_be_timed(wrong, message, capsys):
     assert main(["bench", "mpc", *wrong]) == 2
-    assert "expected at least one solver" in capsys.readouterr().err
+    assert message in capsys.readouterr().err

@@ -9,7 +9,7 @@ import scipy.optimize
 from cablejax.adaptation.belief import AdaptationConfig
 from cablejax.bounded import Result
 from cablejax.control.targets import Target
-from cablejax.mpc import MPC, Action, LevenbergMarquardt, MPCConfig, ProjectedGradient, time_control
+from cablejax.mpc import MPC, Action, LevenbergMarquardt, MPCConfig, ProjectedGradient
 from cablejax.mpc.fallback import ABOUT, RETURNS, _followed, radius_after
 from cablejax.mpc.state import initial_state
 from cablejax.mpc.target_pose import straightened
@@ -450,15 +450,6 @@ def test_new_weights_and_targets_do_not_compile_anew():
     other = dataclasses.replace(control, weights=jnp.asarray(0.7), target=control.target + 0.01)
     other.step(state, Measurement(cable.keypoints, cable.pose))
     assert len(traces) == before > 0
-
-
-def test_times_a_control_call():
-    timing = time_control(controller(), at_rest(START), repeats=3)
-    assert timing.call_ms.shape == (3,)
-    assert timing.first_call_s > 0
-    assert 0 < timing.call_ms.min() <= timing.p50_ms <= timing.p95_ms <= timing.call_ms.max()
-    with pytest.raises(ValueError, match="repeats=0"):
-        time_control(controller(), at_rest(START), repeats=0)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Single plans: certificates, all bounds, bad input, two trials, sampling, many starts, and derivatives of the plan."""
+"""Single plans: certificates, all bounds, bad input, two trials, sampling, and derivatives of the plan."""
 
 import dataclasses
 import functools
@@ -18,7 +18,6 @@ from cablejax.mpc import (
     ShapingProblem,
     differentiable_plan,
     feasible_from,
-    multi_start,
 )
 from mpc_cases import START, poses, problem
 
@@ -161,21 +160,3 @@ def test_sampling_knows_the_way_back_from_outside(solver):
     assert float(value) <= float(value_at(case, case.start(jnp.asarray(STILL)).motion))
     plan, _, _ = solved(solver, with_bounds(min_distance=1.2))
     assert Result(int(plan.result)) is Result.EMPTY_SET
-
-
-def random_starts(problem, n_commands, count, seed=0):
-    """Feasible plans at random: each gripper goes about straight on, at random speed."""
-    heading, noise = jax.random.split(jax.random.key(seed))
-    dtype = problem.target.dtype
-    way = jax.random.normal(heading, (count, 1, 2, 3), dtype)
-    motion = problem.feasible.radius * (way + 0.3 * jax.random.normal(noise, (count, n_commands, 2, 3), dtype)) / 2.0
-    return jax.vmap(problem.feasible.project)(motion)
-
-
-@pytest.mark.slow
-def test_many_starts_give_the_best_of_them():
-    case = problem("S")
-    starts = random_starts(case, STEPS, 4)
-    best, every, values = jax.jit(lambda case: multi_start(case, LevenbergMarquardt(), starts))(case)
-    assert every.motion.shape == (4, STEPS, 2, 3) and values.shape == (4,)
-    assert float(case.value(best.motion)) == pytest.approx(float(values.min()), rel=1e-5)

@@ -11,7 +11,7 @@ from tyro.conf import subcommand
 
 from cablejax.commands.bench_simulate import BenchSimulate
 from cablejax.commands.bench_start import BenchStart
-from cablejax.commands.options import Command, UsageError, say, text_table
+from cablejax.commands.options import Command, UsageError, require_counts, say, text_table
 from cablejax.limits import require
 from cablejax.solver_names import SolverName
 
@@ -41,21 +41,20 @@ class BenchMpc(Command):
 
         from cablejax.commands.workloads import (
             batched_control,
+            control_calls,
             controller_to_s,
             cores_as_devices,
             seconds_in_turns,
+            seconds_of_calls,
             setting,
         )
         from cablejax.control.shaping import initial_history, load_model
-        from cablejax.mpc import time_control
 
         cores_as_devices()
-        least = min(self.repeats, *self.batches, self.horizon + 1)
-        if not self.solvers or least < 1:
-            raise UsageError(
-                f"--solvers {self.solvers}, --horizon {self.horizon}, --repeats {self.repeats}, --batches "
-                f"{self.batches}: expected at least one solver, a horizon of 0, 1 repeat and batches of 1."
-            )
+        require_counts(self, "repeats", "batches")
+        require(self.horizon, "count_from_zero", "--horizon")
+        if not self.solvers:
+            raise UsageError("--solvers is empty, expected at least one solver.")
         on_processor = jax.devices()[0].platform == "cpu"
         batches = self.batches or ((1, 16) if on_processor else (1, 64, 1024))
         model = load_model(self.weights)
@@ -63,8 +62,10 @@ class BenchMpc(Command):
         solvers = {}
         for name in self.solvers:
             say(f"compiling the control step with {name} ...")
-            timing = time_control(controller_to_s(model, name, self.horizon), history, self.repeats)
-            solvers[name] = {"p50_ms": timing.p50_ms, "p95_ms": timing.p95_ms, "first_call_s": timing.first_call_s}
+            call = control_calls(controller_to_s(model, name, self.horizon), history)
+            compiling, *calls = seconds_of_calls(call, self.repeats + 1)
+            p50, p95 = 1e3 * np.percentile(calls, [50, 95])
+            solvers[name] = {"p50_ms": float(p50), "p95_ms": float(p95), "first_call_s": compiling}
         first, batched = controller_to_s(model, self.solvers[0], self.horizon), {}
         for size in map(str, batches):
             say(f"compiling the control step for {size} cables ...")
@@ -110,20 +111,16 @@ class BenchPerception(Command):
         """Times frames of the tracker and returns frames per second."""
         import numpy as np
 
-        from cablejax.commands.workloads import clouds_of_an_arch, setting
+        from cablejax.commands.workloads import clouds_of_an_arch, seconds_of_calls, setting
         from cablejax.perceive import Status, Tracker, TrackerConfig
 
-        for name in ("points", "repeats"):
-            require(getattr(self, name), "count", f"--{name}")
+        require_counts(self, "points", "repeats")
         tracker = Tracker(dataclasses.replace(TrackerConfig(), capacity=self.points))
         clouds, poses = clouds_of_an_arch(self.repeats + 2, self.points, tracker.config.registration.length, self.seed)
         say("compiling the tracker ...")
         state, seen = tracker.init(clouds[0], poses[0])
-        first, frame = [], []
-        for _ in range(5):
-            begin = time.perf_counter()
-            tracker.init(clouds[0], poses[0])[1].keypoints.block_until_ready()
-            first.append(1e3 * (time.perf_counter() - begin))
+        first = seconds_of_calls(lambda: tracker.init(clouds[0], poses[0])[1].keypoints.block_until_ready(), 5)
+        frame = []
         for cloud, now in zip(clouds, poses, strict=True):
             begin = time.perf_counter()
             state, seen = tracker.step(state, cloud, now)
@@ -141,7 +138,7 @@ class BenchPerception(Command):
             "p50_ms": float(p50),
             "p95_ms": float(p95),
             "frames_per_second": float(1e3 / p50),
-            "first_frame_ms": float(np.median(first)),
+            "first_frame_ms": 1e3 * float(np.median(first)),
             **setting(),
         }
         return result, (
@@ -183,10 +180,9 @@ class BenchLoop(Command):
         from cablejax.control.shaping import load_model
 
         cores_as_devices()
+        require_counts(self, "batches", "steps", "rounds")
         if not self.batches:
             raise UsageError("--batches is empty, expected at least one size.")
-        for name, value in (("steps", self.steps), ("rounds", self.rounds), *(("batches", n) for n in self.batches)):
-            require(value, "count", f"--{name}")
         model = load_model(self.weights)
         controller = controller_to_s(model, self.solver)
         run = closed_loop(controller, self.steps, Discretisation(model.cable))

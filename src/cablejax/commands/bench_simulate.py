@@ -8,7 +8,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from cablejax.commands.cable import find_cable
-from cablejax.commands.options import Command, say, text_table
+from cablejax.commands.options import Command, require_counts, say, text_table
 from cablejax.limits import require
 
 if TYPE_CHECKING:
@@ -52,8 +52,7 @@ class BenchSimulate(Command):
         from cablejax.commands.workloads import setting
         from cablejax.simulate import ENGINES
 
-        for name in ("batch", "seconds", "rounds", "threads", "steps"):
-            require(getattr(self, name), "count", f"--{name}")
+        require_counts(self, "batch", "seconds", "rounds", "threads", "steps")
         require(self.trajectories, "count_from_zero", "--trajectories")
         cable = find_cable(self.cable)
         engines: dict[str, Engine] = {name: kind(self.chain(cable, name)) for name, kind in ENGINES.items()}  # pyright: ignore[reportCallIssue]

@@ -16,9 +16,8 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from cablejax.commands.options import Command, UsageError, say, text_table
+from cablejax.commands.options import Command, UsageError, require_counts, say, text_table
 from cablejax.compiled_programs import FOLDER, keep_compiled_programs
-from cablejax.limits import require
 
 Part = Literal["import", "help", "control", "verdict"]
 """What is timed."""
@@ -54,7 +53,7 @@ class BenchStart(Command):
         from cablejax.commands.workloads import setting
         from cablejax.gaplog import read_gap_log
 
-        require(self.repeats, "count", "--repeats")
+        require_counts(self, "repeats")
         if not self.parts or self.horizon < 0:
             raise UsageError(
                 f"--parts {self.parts}, --horizon {self.horizon}: expected some of {', '.join(get_args(Part))}, and a "
@@ -159,20 +158,14 @@ def first_call(weights: str, horizon: int) -> None:
         horizon: of the plan.
     """
     keep_compiled_programs()
-    import jax
-    import numpy as np
-
-    from cablejax.commands.workloads import controller_to_s
+    from cablejax.commands.workloads import control_calls, controller_to_s
     from cablejax.control.shaping import initial_history, load_model
-    from cablejax.types import Measurement
 
     model = load_model(weights)
-    history = initial_history(model.cable, model.config)
     controller = controller_to_s(model, "levenberg-marquardt", horizon)
-    state = controller.init(history)
-    measurement = Measurement(np.asarray(history.keypoints[-1]), np.asarray(history.gripper_pose))
+    call = control_calls(controller, initial_history(model.cable, model.config))
     begin, before = time.perf_counter(), time.process_time()
-    jax.block_until_ready(controller.step(state, measurement))
+    call()
     print(json.dumps({"wall_s": time.perf_counter() - begin, "cpu_s": time.process_time() - before}))
 
 

@@ -46,6 +46,14 @@ class Command(abc.ABC):
         print(json_format.dumps(result, indent=2, allow_nan=False) if self.json else text)
 
 
+def require_counts(command: Command, *names: str) -> None:
+    """Raises ValueError unless options of a command, or all numbers of a list, are whole numbers from 1."""
+    for name in names:
+        value = getattr(command, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            require(number, "count", f"--{name}")
+
+
 def choose_device(device: Literal["auto", "cpu", "gpu"]) -> None:
     """Makes JAX compute on `device`.
 

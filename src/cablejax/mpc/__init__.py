@@ -3,7 +3,7 @@
 from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.controller import MPC
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
-from cablejax.mpc.plan import Plan, Solver, differentiable_plan, multi_start
+from cablejax.mpc.plan import Plan, Solver, differentiable_plan
 from cablejax.mpc.planners import (
     SOLVERS,
     Dogleg,
@@ -14,13 +14,11 @@ from cablejax.mpc.planners import (
 from cablejax.mpc.problem import ObjectiveConfig, Rollout, ShapingProblem
 from cablejax.mpc.sampling import CrossEntropy, PathIntegral
 from cablejax.mpc.state import Action, MPCInfo, MPCState
-from cablejax.mpc.timing import ControlTiming, time_control
 
 __all__ = [
     "MPC",
     "SOLVERS",
     "Action",
-    "ControlTiming",
     "CrossEntropy",
     "Dogleg",
     "FeasibleSet",
@@ -38,6 +36,4 @@ __all__ = [
     "Solver",
     "differentiable_plan",
     "feasible_from",
-    "multi_start",
-    "time_control",
 ]

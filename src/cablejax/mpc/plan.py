@@ -1,4 +1,4 @@
-"""Plans: the interface of planners, the best of several starts, derivatives with respect to the problem."""
+"""Plans: the interface of planners, and derivatives with respect to the problem."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import dataclasses
 from typing import Protocol
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from cablejax.bounded.certificate import Certificate, certify
@@ -60,16 +59,6 @@ def plan_from(solution: Solution) -> Plan:
         linearisations=solution.stats.linearisations,
         optimality=solution.optimality,
     )
-
-
-def multi_start(
-    problem: ShapingProblem, solver: Solver, guesses: Float[Array, "S T Q 3"]
-) -> tuple[Plan, Plan, Float[Array, " S"]]:
-    """The best plan of several starts; all of them, with a leading axis S; and their values [m^2], inf for NaN."""
-    every = jax.vmap(lambda guess: solver(problem, problem.start(guess)))(guesses)
-    values = jnp.where(jnp.isfinite(every.value), every.value, jnp.inf)
-    best = jnp.argmin(values)
-    return jax.tree.map(lambda leaf: leaf[best], every), every, values
 
 
 def differentiable_plan(problem: ShapingProblem, motion: Float[Array, "T Q 3"]) -> Float[Array, "T Q 3"]:
