@@ -34,13 +34,13 @@ from cablejax.effects.physics import nominal_physics
 from cablejax.perceive import Status, Tracker, TrackerConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
-from cablejax.perceive.synthetic import Clutter, scatter
 from cablejax.report.style import LIGHT
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import random_motion
 from closed_loop.cases import mujoco_plant, stiffness_cases
 from closed_loop.methods import METHODS, NO_PRIOR_LEARNER, model_named
 from closed_loop.suite import run_case
+from clutter import Clutter, scatter
 from pages import markdown_table, page_of_results, publish
 from rows import Rows, made_on
 

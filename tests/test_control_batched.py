@@ -14,7 +14,7 @@ import pytest
 from cablejax.bounded import Result
 from cablejax.cable import Cable, Discretisation
 from cablejax.commands.workloads import varied_params
-from cablejax.control.batched import LoopConfig, for_each_cable, shape_batch
+from cablejax.control.batched import for_each_cable, shape_batch
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import NetworkDynamics, load_model, make_controller
 from cablejax.control.targets import Target, make_target, straight_start
@@ -69,7 +69,7 @@ def targets(letters: str) -> list[Target]:
 
 
 def arguments(letters="USU", ratios=RATIOS):
-    """Plant, cables, and where they start; controller, targets and config follow."""
+    """Plant, cables, and where they start; controller, targets and number of commands follow."""
     starts = np.stack([straight_start(CABLE.cable)] * len(letters))
     return ENGINE, varied_params(CABLE, ratios), ENGINE.initial_state(starts)
 
@@ -90,10 +90,10 @@ def alone(controller, params: Physics, target: Target, steps: int):
 
 
 def test_a_batch_of_loops_equals_each_loop_alone():
-    config, letters = LoopConfig(steps=6), "USU"
+    steps, letters = 6, "USU"
     controller = GoToTarget(shapes("U")[0], 0.05)
     engine, params, state = arguments(letters)
-    run = shape_batch(engine, params, state, controller, shapes(letters), config)
+    run = shape_batch(engine, params, state, controller, shapes(letters), steps)
     assert run.keypoints.shape == (3, 7, 5, 2) and run.twist.shape == (3, 6, 2, 3)
     for i, target in enumerate(targets(letters)):
         one = alone(GoToTarget(target.keypoints, 0.05), member(params, i), target, 6)
@@ -109,36 +109,14 @@ def test_a_batch_of_loops_equals_each_loop_alone():
 
 
 @pytest.mark.slow
-def test_trials_have_their_own_noise_and_gaps():
-    letters = "UUU"
-    config = LoopConfig(steps=4, keypoint_noise=0.002, keypoint_dropout=0.4)
-    engine, params, state = arguments(letters, np.ones(3))
-    controller = GoToTarget(shapes("U")[0], 0.0)
-    run = shape_batch(
-        engine, params, state, controller, shapes(letters), config, seeds=np.array([4, 4, 5])
-    )  # fmt: skip
-    keypoints, pose = np.asarray(run.keypoints), np.asarray(run.gripper_pose)
-    np.testing.assert_array_equal(keypoints[0], keypoints[1])
-    missing = np.isnan(keypoints[..., 0])
-    assert not missing[:, 0].any() and not missing[:, :, [0, -1]].any()
-    assert 0.2 < missing[::2, 1:, 1:-1].mean() < 0.6
-    assert (missing[0] != missing[2]).any()
-    noise = (keypoints[:, :, [0, -1]] - pose[..., :2])[::2]
-    assert 0.0014 < noise.std() < 0.0026
-    assert np.abs(noise[0] - noise[1]).max() > 1e-3
-    assert np.isfinite(run.error_cm).all()
-
-
-@pytest.mark.slow
 def test_the_controller_in_a_batch_equals_the_controller_alone():
     """With a graph network, the online residual and a plan of two steps."""
     graphdef, weights = network(SMALL)
     config = MPCConfig(horizon=1, history_length=SMALL.history, solver=OneGradientStep())
     engine, params, state = arguments("SU", np.array([2.0, 0.5]))
-    loop = LoopConfig(steps=5)
     target = targets("SU")[1]
     controller = MPC(config, NetworkDynamics(graphdef), weights, target.keypoints)
-    run = shape_batch(engine, params, state, controller, shapes("SU"), loop)
+    run = shape_batch(engine, params, state, controller, shapes("SU"), 5)
     one = alone(controller, member(params, 1), target, 5)
     np.testing.assert_allclose(run.keypoints[1], one.keypoints, atol=3e-6)
     np.testing.assert_allclose(run.twist[1], one.twist[:-1], atol=3e-6)
@@ -155,7 +133,7 @@ import sys; sys.path.insert(0, {folder!r})
 import jax, numpy as np
 from test_control_batched import *
 controller = GoToTarget(shapes("U")[0], 0.05)
-run = shape_batch(*arguments("USU"), controller, shapes("USU"), LoopConfig(steps=3), devices=jax.devices())
+run = shape_batch(*arguments("USU"), controller, shapes("USU"), 3, devices=jax.devices())
 print(jax.device_count()); np.save({path!r}, run.keypoints)
 """
     results = []
@@ -187,7 +165,7 @@ def test_the_batch_ends_where_the_contact_plant_ends():
     state = engine.initial_state(np.stack([straight_start(cable.cable)] * 2))
     goals = np.stack([target.keypoints] * 2)
     run = shape_batch(
-        engine, varied_params(cable, ratios), state, controller, goals, LoopConfig(steps=steps)
+        engine, varied_params(cable, ratios), state, controller, goals, steps
     )  # fmt: skip
     fine = Discretisation(n_links=24, dimension=3, timestep=0.005)
     for i, ratio in enumerate(ratios):
@@ -219,11 +197,10 @@ def test_wrong_requests_are_refused():
     engine, params, state = arguments("UU", np.ones(2))
     controller = GoToTarget(shapes("U")[0], 0.05)
     with pytest.raises(ValueError, match=r"Targets of shape \(2, 5\)"):
-        shape_batch(engine, params, state, controller, shapes("UU")[:, :, 0], LoopConfig(steps=1))
+        shape_batch(engine, params, state, controller, shapes("UU")[:, :, 0], 1)
     with pytest.raises(ValueError, match="expected 1, the number of targets"):
-        shape_batch(engine, params, state, controller, shapes("U"), LoopConfig(steps=1))
+        shape_batch(engine, params, state, controller, shapes("U"), 1)
     with pytest.raises(ValueError, match="multiple of the time step"):
-        shape_batch(engine, params, state, controller, shapes("UU"), LoopConfig(steps=1, interval=0.015))
-    for wrong in ({"steps": 0}, {"steps": 1, "keypoint_dropout": 1.0}, {"steps": 1, "keypoint_noise": -1.0}):
-        with pytest.raises(ValueError, match="LoopConfig"):
-            LoopConfig(**wrong)
+        shape_batch(engine, params, state, controller, shapes("UU"), 1, interval=0.015)
+    with pytest.raises(ValueError, match="steps is 0"):
+        shape_batch(engine, params, state, controller, shapes("UU"), 0)

@@ -96,15 +96,10 @@ class Solution:
     stats: Stats
     optimality: Float[Array, "*batch"]
 
-    def certificate(
-        self, fn: Callable[[Array, Any], Array], feasible: AbstractSet, args: Any = None, near: float | None = None
-    ) -> Certificate:
-        """The first-order conditions at `value`, from the gradient of `fn` there; of residuals, half their squares'.
-
-        `near` is the distance within which a bound counts as active, see `certify`.
-        """
+    def certificate(self, fn: Callable[[Array, Any], Array], feasible: AbstractSet, args: Any = None) -> Certificate:
+        """The first-order conditions at `value`, from the gradient of `fn` there; of residuals, half their squares'."""
 
         def objective(y):
             return value_of(fn(y, args))
 
-        return certify(jax.grad(objective)(self.value), feasible, self.value, near)
+        return certify(jax.grad(objective)(self.value), feasible, self.value)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from cablejax.cable import Discretisation
 from cablejax.commands.options import say
-from cablejax.control.batched import BatchRun, LoopConfig, for_each_cable, shape_batch
+from cablejax.control.batched import BatchRun, for_each_cable, shape_batch
 from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import make_target, straight_start
 from cablejax.dataset.drawing import draw_all
@@ -28,7 +28,6 @@ from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.evaluate import snapping
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.mpc import MPC, MPCConfig
-from cablejax.perceive.synthetic import Clutter, scatter
 from cablejax.provenance import machine
 from cablejax.simulate import MjxEngine
 from cablejax.simulate.compile import on_devices
@@ -92,7 +91,7 @@ def program_bytes(compiled: Any) -> int:
 def clouds_of_an_arch(
     count: int, points: int, length: float, seed: int = 0
 ) -> tuple[list[Float[np.ndarray, "n 2"]], list[Float[np.ndarray, "Q 3"]]]:
-    """Point clouds of an arch that is carried to and fro by a millimetre per frame, and the grippers' poses.
+    """Point clouds, with 2 mm noise, of an arch that is carried to and fro by a millimetre per frame, and its poses.
 
     Args:
         count: number of frames.
@@ -103,7 +102,11 @@ def clouds_of_an_arch(
     random, pose = np.random.default_rng(seed), np.array([[-0.3, 0.0, 0.8], [0.35, 0.0, -0.6]])
     curve = solve_elastica(pose, length).position
     shifts = 0.01 * np.sin(0.1 * np.arange(count))
-    clouds = [scatter(curve + np.array([shift, 0.0]), Clutter(points=points), random) for shift in shifts]
+    grid, clouds = np.linspace(0.0, 1.0, len(curve)), []
+    for shift in shifts:
+        s = random.random(points)
+        cloud = np.stack([np.interp(s, grid, axis) for axis in curve.T], axis=1)
+        clouds.append(cloud + [shift, 0.0] + 0.002 * random.standard_normal(cloud.shape))
     return clouds, [pose + np.array([shift, 0.0, 0.0]) for shift in shifts]
 
 
@@ -219,7 +222,6 @@ def varied_params(config: Discretisation, stiffness_ratio: Float[np.ndarray, " B
 
 def closed_loop(controller: MPC, steps: int, chain: Discretisation) -> Callable[[int], BatchRun]:
     """A function that shapes a number of straight cables, half to twice as stiff as nominal, for `steps` commands."""
-    config = LoopConfig(steps, interval=controller.interval)
     engine = MjxEngine(chain)
 
     @functools.lru_cache
@@ -229,7 +231,9 @@ def closed_loop(controller: MPC, steps: int, chain: Discretisation) -> Callable[
 
     def run(size: int) -> BatchRun:
         params, state, goals = inputs(size)
-        batch = shape_batch(engine, params, state, controller, goals, config, devices=jax.devices()[:size])
-        return jax.block_until_ready(batch)
+        devices, interval = jax.devices()[:size], controller.interval
+        return jax.block_until_ready(
+            shape_batch(engine, params, state, controller, goals, steps, interval=interval, devices=devices)
+        )
 
     return run

@@ -1,6 +1,6 @@
 """The whole closed loop as one compiled call: many cables, each with its own target, shaped side by side.
 
-Plant (an engine in JAX), camera, model, residual and controller are pure functions, so a table of trials is a
+Plant (an engine in JAX), model, residual and controller are pure functions, so a table of trials is a
 `lax.scan` over control steps of all of them. It runs the same controllers as `control.loop.run_closed_loop`, but a
 batch of cables in one call instead of one cable in Python. The plant is the planar simulator here; the contact plant in
 C MuJoCo, which the model has never seen, stays the reference.
@@ -18,45 +18,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from cablejax.control.controller import Controller, check_interval, resting
 from cablejax.control.run import shape_error_cm
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
-from cablejax.limits import check
+from cablejax.limits import require
 from cablejax.simulate.chain.engine import ChainEngine
 from cablejax.simulate.compile import AXIS, compiler_options, on_devices
 from cablejax.simulate.engine import refuse_lags
 from cablejax.simulate.mjx_engine import MjxEngine
-from cablejax.simulate.plant_config import check_camera
 from cablejax.types import CableState, Measurement
 
 REPORTED = ("residual_share", "radius")
 """Fields of a controller's report that a run keeps."""
-
-
-@dataclasses.dataclass(frozen=True)
-class LoopConfig:
-    """Settings of a batch of trials.
-
-    Attributes:
-        steps: commands of each trial, T.
-        interval: time that each command is held [s].
-        rest: intervals without motion before the first command.
-        keypoint_noise: standard deviation of the observed keypoints [m] per coordinate.
-        keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last, which the
-            grippers hold, and except before the first command.
-    """
-
-    steps: int
-    interval: float = 1.0
-    rest: int = 1
-    keypoint_noise: float = 0.0
-    keypoint_dropout: float = 0.0
-
-    def __post_init__(self):
-        check(self, "interval", steps="commands", rest="count_from_zero")
-        check_camera(self)
 
 
 @jax.tree_util.register_dataclass
@@ -65,10 +40,10 @@ class BatchRun:
     """B trials of T commands; sample 0 is before the first command. A cable whose simulation diverged is NaN from then.
 
     Attributes:
-        keypoints: observed cables [m], NaN = not observed, shape [B, T + 1, N, 2].
+        keypoints: of the cables [m], shape [B, T + 1, N, 2].
         gripper_pose: (x, y, theta) [m, rad], shape [B, T + 1, Q, 3].
         twist: commands [m/s, rad/s], shape [B, T, Q, 3].
-        error_cm: root mean square distance of the observed keypoints to the target [cm], shape [B, T + 1].
+        error_cm: root mean square distance of the keypoints to the target [cm], shape [B, T + 1].
         residual_share: the controller's report, NaN where it makes none, shape [B, T].
         radius: the controller's bound on one step's motion [m], NaN where it reports none, shape [B, T].
     """
@@ -130,9 +105,9 @@ def shape_batch(
     state: CableState,
     controller: Controller,
     targets: Float[Array | np.ndarray, "B N 2"],
-    config: LoopConfig,
+    steps: int,
     *,
-    seeds: Int[np.ndarray, " B"] | None = None,
+    interval: float = 1.0,
     devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
 ) -> BatchRun:
     """Shapes B cables side by side, in one compiled call; another batch size or configuration compiles again.
@@ -143,28 +118,28 @@ def shape_batch(
         state: where each cable starts, likewise: `engine.initial_state` of stacked gripper poses.
         controller: a pytree with a leaf `target`, which is replaced by each trial's own; its other leaves are shared.
         targets: desired keypoints [m], shape [B, N, 2].
-        config: length, timing and camera of the trials.
-        seeds: of each trial's noise and gaps; by default 0, 1, ...
+        steps: commands of each trial, T.
+        interval: time that each command is held [s]; the grippers also rest for one before the first command.
         devices: to spread the batch over; by default the one on which the arguments are.
 
     Raises:
-        ValueError: the batch axes differ, the cable is not planar, arms or camera lag, a target has another number of
-            keypoints, or the controller was made for another interval.
+        ValueError: `steps` is no number of commands, the batch axes differ, the cable is not planar, arms or camera
+            lag, a target has another number of keypoints, or the controller was made for another interval.
     """
+    require(steps, "commands", "steps")
     size, chain = len(targets), engine.config
     if chain.dimension != 2 or np.shape(targets) != (size, chain.cable.n_keypoints, 2):
         raise ValueError(
             f"Targets of shape {np.shape(targets)} for a cable with {chain.cable.n_keypoints} keypoints in "
             f"{chain.dimension} dimensions, expected (B, {chain.cable.n_keypoints}, 2) on a planar cable."
         )
-    engine.substeps(config.interval)
-    check_interval(controller, config.interval)
+    engine.substeps(interval)
+    check_interval(controller, interval)
     refuse_lags(params)
-    seeds = np.arange(size) if seeds is None else np.asarray(seeds)
     controllers = _with_target(controller, jnp.asarray(targets, float))
     batched = _with_target(jax.tree.map(lambda _: False, controller), True)
     own, shared = eqx.partition(controllers, batched)
-    batch = (params, state, own, seeds)
+    batch = (params, state, own)
     lengths = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(batch)}
     if lengths != {(size,)}:
         raise ValueError(f"The leading axes are {sorted(lengths)}, expected {size}, the number of targets, everywhere.")
@@ -172,7 +147,7 @@ def shape_batch(
         batch = on_devices(batch, devices, -(-size // len(devices)))
         shared = jax.device_put(shared, NamedSharding(Mesh(np.array(devices), (AXIS,)), PartitionSpec()))
     spread_over = None if devices is None else tuple(devices)
-    run = _compiled_batch(engine, config, may_touch(params), spread_over)(shared, *batch)
+    run = _compiled_batch(engine, steps, interval, may_touch(params), spread_over)(shared, *batch)
     return run if devices is None else jax.tree.map(lambda leaf: leaf[:size], run)
 
 
@@ -182,10 +157,10 @@ def _with_target(controller: Any, target: Any) -> Any:
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled_batch(engine: MjxEngine | ChainEngine, config: LoopConfig, touching: bool, devices: Any):
-    def trials(shared, params, state, own, seeds):
+def _compiled_batch(engine: MjxEngine | ChainEngine, steps: int, interval: float, touching: bool, devices: Any):
+    def trials(shared, params, state, own):
         params = params if touching else without_obstacle(params)
-        return _trials(engine, config, own, shared, params, state, seeds)
+        return _trials(engine, steps, interval, own, shared, params, state)
 
     spread = trials if devices is None else _shared_out(trials, devices, 1)
     return jax.jit(spread, compiler_options=compiler_options())
@@ -193,30 +168,26 @@ def _compiled_batch(engine: MjxEngine | ChainEngine, config: LoopConfig, touchin
 
 def _trials(
     engine: MjxEngine | ChainEngine,
-    config: LoopConfig,
+    steps: int,
+    interval: float,
     own: Any,
     shared: Any,
     params: Physics,
     cables: CableState,
-    seeds: Int[Array, " B"],
 ) -> BatchRun:
     """All trials of a device; a controller is put together of what is its `own` and what is `shared`."""
-    keys = jax.vmap(jax.random.key)(seeds)
 
     def moved(params, cable, twist):
-        cable, shown = engine.unroll(params, cable, twist, config.interval)
+        cable, shown = engine.unroll(params, cable, twist, interval)
         return cable, shown.keypoints[-1]
 
-    def seen(key, index, keypoints):
-        return _observed(config, jax.random.fold_in(key, index), keypoints)
+    def start(own, cable, keypoints):
+        controller = eqx.combine(own, shared)
+        return controller.init(resting(controller, keypoints, cable.gripper_pose))
 
-    def start(own, key, cable, keypoints):
-        first, controller = _noisy(config, jax.random.fold_in(key, config.steps), keypoints), eqx.combine(own, shared)
-        return first, controller.init(resting(controller, first, cable.gripper_pose))
-
-    still = jnp.zeros((len(seeds), config.rest, *cables.gripper_pose.shape[1:]), cables.qpos.dtype)
-    cables, keypoints = jax.vmap(moved)(params, cables, still)
-    first, states = jax.vmap(start)(own, keys, cables, keypoints)
+    pose = cables.gripper_pose
+    cables, first = jax.vmap(moved)(params, cables, jnp.zeros((len(pose), 1, *pose.shape[1:]), cables.qpos.dtype))
+    states = jax.vmap(start)(own, cables, first)
 
     def commanded(own, state, measurement):
         state, twist, info = eqx.combine(own, shared).step(state, measurement)
@@ -224,14 +195,13 @@ def _trials(
 
     command = for_each_cable(commanded)
 
-    def step(carry, index):
+    def step(carry, _):
         cables, states, keypoints = carry
         states, twist, report = command(own, states, Measurement(keypoints, cables.gripper_pose))
         cables, keypoints = jax.vmap(moved)(params, cables, twist[:, None])
-        keypoints = jax.vmap(seen, in_axes=(0, None, 0))(keys, index, keypoints)
         return (cables, states, keypoints), (keypoints, cables.gripper_pose, twist, *report)
 
-    _, samples = jax.lax.scan(step, (cables, states, first), jnp.arange(config.steps))
+    _, samples = jax.lax.scan(step, (cables, states, first), length=steps)
     later, pose, twist, share, radius = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), samples)
     keypoints = jnp.concatenate([first[:, None], later], axis=1)
     targets = jax.vmap(lambda own: eqx.combine(own, shared).target)(own)
@@ -243,20 +213,3 @@ def _trials(
         residual_share=share,
         radius=radius,
     )
-
-
-def _noisy(config: LoopConfig, key: Array, keypoints: Float[Array, "N 2"]) -> Float[Array, "N 2"]:
-    if not config.keypoint_noise:
-        return keypoints
-    return keypoints + config.keypoint_noise * jax.random.normal(key, keypoints.shape, keypoints.dtype)
-
-
-def _observed(config: LoopConfig, key: Array, keypoints: Float[Array, "N 2"]) -> Float[Array, "N 2"]:
-    """The camera's report of the true keypoints."""
-    noise, gaps = jax.random.split(key)
-    keypoints = _noisy(config, noise, keypoints)
-    if not config.keypoint_dropout:
-        return keypoints
-    missing = jax.random.bernoulli(gaps, config.keypoint_dropout, keypoints.shape[:1])
-    missing = missing.at[jnp.array([0, -1])].set(False)
-    return jnp.where(missing[:, None], jnp.nan, keypoints)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
@@ -113,26 +112,6 @@ class CableEffect(Effect, abc.ABC):
         """The effect's place: keys "along_cable_m", "time_s", "table_m" of the verdict, where they apply."""
         del values, variant, config
         return {}
-
-
-def shifted(parameters: Mapping[str, float], place: Sequence[float]) -> dict[str, float]:
-    """Parameters of which x_m and y_m [m] are a place on the table, in a world whose origin is another place."""
-    by = {"x_m": place[0], "y_m": place[1]}
-    return {name: value - by.get(name, 0.0) for name, value in parameters.items()}
-
-
-def moved(effect: CableEffect, place: Float[np.ndarray, "2"]) -> CableEffect:
-    """An effect whose parameters x_m and y_m [m] have their bounds, prior medians and null values about a place."""
-    by = {"x_m": float(place[0]), "y_m": float(place[1])}
-    shifts = [by.get(p.name, 0.0) for p in effect.parameters]
-    parameters = tuple(
-        dataclasses.replace(p, low=p.low + shift, high=p.high + shift, centre=p.centre + shift) if shift else p
-        for p, shift in zip(effect.parameters, shifts, strict=True)
-    )
-    null = tuple(value + shift for value, shift in zip(effect.null, shifts, strict=True))
-    other = copy.copy(effect)
-    vars(other).update(parameters=parameters, null=null)
-    return other
 
 
 def section(centre: Any, width: Any, config: Discretisation) -> Any:

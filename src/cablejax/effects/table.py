@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +11,7 @@ from jaxtyping import Float
 
 from cablejax.arrays import filled
 from cablejax.cable import Discretisation
-from cablejax.effects.base import CableEffect, Context, moved, shifted
+from cablejax.effects.base import CableEffect, Context
 from cablejax.effects.effect import Parameter
 
 # Discs tried as obstacles: of which size at most, how many, and how far apart [m].
@@ -66,7 +68,32 @@ def _swept(context: Context, spacing: float) -> np.ndarray:
     return squares[np.argsort(-visits)] * spacing
 
 
-class FrictionPatch(CableEffect):
+class _AtPlace(CableEffect):
+    """An effect about a place on the table, whose parameters begin with x_m and y_m [m]."""
+
+    def around(self, place):
+        """Bounds, prior medians and null values of its centre lie about the place."""
+        shifts = [*map(float, place), *[0.0] * (len(self.parameters) - 2)]
+        parameters = tuple(
+            dataclasses.replace(p, low=p.low + shift, high=p.high + shift, centre=p.centre + shift) if shift else p
+            for p, shift in zip(self.parameters, shifts, strict=True)
+        )
+        null = tuple(value + shift for value, shift in zip(self.null, shifts, strict=True))
+        other = copy.copy(self)
+        vars(other).update(parameters=parameters, null=null)
+        return other
+
+    def seen_from(self, parameters, place):
+        """Its centre moves."""
+        by = {"x_m": place[0], "y_m": place[1]}
+        return {name: value - by.get(name, 0.0) for name, value in parameters.items()}
+
+    def location(self, values, variant, config):
+        """The centre on the table [m]."""
+        return {"table_m": [float(values[0]), float(values[1])]}
+
+
+class FrictionPatch(_AtPlace):
     """Another coefficient inside a round region of the table."""
 
     name = "friction_patch"
@@ -79,14 +106,6 @@ class FrictionPatch(CableEffect):
     )
     null = (0.4, 0.1, 0.12, 1.0)
     amplitude, reversible, stage, alone = 3, True, 1, True
-
-    def around(self, place):
-        """Its centre is sought about the place."""
-        return moved(self, place)
-
-    def seen_from(self, parameters, place):
-        """Its centre moves."""
-        return shifted(parameters, place)
 
     def apply(self, physics, values, variant, config):
         """Sets the patch's centre and radius [m] and the coefficient inside, whatever it is outside."""
@@ -115,10 +134,6 @@ class FrictionPatch(CableEffect):
 
     def _from_reported(self, parameters, config):
         return {**parameters, "ratio": parameters["coefficient"] / _believed(config)}
-
-    def location(self, values, variant, config):
-        """The patch's centre on the table [m]."""
-        return {"table_m": [float(values[0]), float(values[1])]}
 
 
 class ViscousDrag(CableEffect):
@@ -176,7 +191,7 @@ class GravityTilt(CableEffect):
         return {"sine_x": sine * np.cos(direction), "sine_y": sine * np.sin(direction)}
 
 
-class Obstacle(CableEffect):
+class Obstacle(_AtPlace):
     """An unmodelled fixed disc touches the cable."""
 
     name = "obstacle"
@@ -188,14 +203,6 @@ class Obstacle(CableEffect):
     )
     null = (3.0, 3.0, 0.005)
     alone = True
-
-    def around(self, place):
-        """Its centre is sought about the place."""
-        return moved(self, place)
-
-    def seen_from(self, parameters, place):
-        """Its centre moves."""
-        return shifted(parameters, place)
 
     def apply(self, physics, values, variant, config):
         """Sets the disc's centre and radius [m]."""
@@ -209,10 +216,6 @@ class Obstacle(CableEffect):
     def starts(self, context):
         """Discs that the simulated cable passes through and the observed one lies against."""
         return [(0, disc) for disc in _in_the_way(context)]
-
-    def location(self, values, variant, config):
-        """The disc's centre on the table [m]."""
-        return {"table_m": [float(values[0]), float(values[1])]}
 
 
 def _in_the_way(context: Context) -> list[tuple[float, float, float]]:
