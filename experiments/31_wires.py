@@ -27,12 +27,12 @@ from matplotlib.figure import Figure
 
 from cablejax.cable import GRAVITY
 from cablejax.provenance import machine, versions
-from cablejax.recordings.wires import HangingWire, read_wires
 from cablejax.report.style import LIGHT
 from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points
 from cablejax.spatial.hanging import Photographs, WireDiagnosis, diagnose_wire, rig_error, wire_verdict_json
 from cablejax.spatial.hanging_effects import EFFECTS
 from pages import markdown_table, publish
+from real_cables.wires import HangingWire, read_wires
 
 OUTSIDE = (0.0, 0.005, 0.01, 0.015)
 """How far outside of the first and last traced point the clamps may be [m]: nothing, to half a spacing."""

@@ -48,7 +48,6 @@ from cablejax.perceive.tracker import padded
 from cablejax.recordings.bags import import_mcap
 from cablejax.recordings.lerobot import write_lerobot
 from cablejax.recordings.mcap_log import write_mcap
-from cablejax.recordings.wires import read_wires
 from cablejax.simulate import play
 from cablejax.spatial.windows import windows_of
 from cli_cases import made_up_run, small_model
@@ -207,20 +206,6 @@ def import_pickle(folder, edit):
     content = pickle.dumps(swinging(30).transpose(0, 2, 1))
     (folder / "1.pkl").write_bytes(edges.edited_bytes(content, edit))
     return command("import", "deform", folder / "1.pkl", "--out", folder / "log.npz")
-
-
-def wire_arrays(folder, edit):
-    points = np.zeros((1, 2, 9, 3))
-    points[..., 0], points[..., 2] = np.linspace(0, 0.5, 9), 0.05 * np.sin(np.linspace(0, np.pi, 9))
-    arrays = {
-        "wire": ["red"],
-        "keypoints": points,
-        "length_m": 0.55,
-        "mass_per_length_kg_m": [0.02],
-        "EI_published_Nm2": [[1e-3, 1e-3]],
-    }
-    (folder / "w.npz").write_bytes(edges.edited_archive(arrays, edit))
-    return answer(lambda: read_wires(folder / "w.npz") and None)
 
 
 def import_bag(folder, edit):
@@ -472,7 +457,6 @@ EDGES = {
     "csv": Edge(160, pair(pair(st.integers(0, 1), st.integers(0, 1)), edges.WORDS), import_table),
     "deform": Edge(80, edges.ARRAYS, import_deform),
     "pickle": Edge(60, edges.BYTES, import_pickle),
-    "wires": Edge(60, edges.ARRAYS, wire_arrays),
     "bag": Edge(30, edges.BYTES, import_bag),
     "cloud npz": Edge(120, edges.ARRAYS, cloud_arrays),
     "cloud folder": Edge(120, pair(st.sampled_from(("ascii", "binary")), edges.WORDS), cloud_folder),

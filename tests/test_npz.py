@@ -12,9 +12,9 @@ from cablejax.gaplog import read_gap_log
 from cablejax.npz import NpzError, read_npz
 from cablejax.perceive.recording import read_clouds
 from cablejax.recordings.deform import read_deform
-from cablejax.recordings.wires import read_wires
 from cablejax.text_file import read_json, write_json
 from file_cases import with_other_bytes
+from real_cables.wires import read_wires
 
 DEEP = "[" * 100_000
 

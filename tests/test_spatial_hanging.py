@@ -11,7 +11,6 @@ from scipy.integrate import solve_bvp
 
 from cablejax.cable import GRAVITY
 from cablejax.diagnose.protocol import explanation
-from cablejax.recordings.wires import read_wires
 from cablejax.simulate import hanging
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points, joint_arclength
@@ -24,6 +23,7 @@ from cablejax.spatial.hanging import (
     wire_verdict_json,
 )
 from cablejax.spatial.hanging_effects import EFFECTS, wire_shape
+from real_cables.wires import read_wires
 from recording_cases import DATA, needs_wires
 
 LENGTH, LINKS = 1.0, 80

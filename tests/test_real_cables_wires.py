@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cablejax.recordings.wires import read_wires
+from real_cables.wires import read_wires
 from recording_cases import DATA, needs_wires
 
 
