@@ -15,9 +15,9 @@ from cablejax.simulate.composite import link_lengths, node_offsets
 
 CENTRE_DEPTH = np.pi / 4
 """How far behind its visible surface the axis of a cylinder lies on average, seen from the side, in radii."""
-_CLEAR, _VISIBLE = 2.5, 0.75
-"""Standard deviations of the range above the table at which heights that are taken for cable begin, and the part of the
-cable's diameter at which they begin at the latest."""
+_CLEAR, _LEAST, _VISIBLE = 2.5, 0.5, 0.75
+"""Standard deviations of the range above the table at which heights that are taken for cable begin, and the parts of
+the cable's diameter at which they begin at the earliest and at the latest."""
 MARGIN = 0.01
 """Width [m] around the cable's outline in which rays are cast. All others meet the table, which has a formula."""
 
@@ -36,9 +36,6 @@ class CameraConfig:
         range_noise: standard deviation of the measured range [m].
         dropout: probability that a pixel has no range.
         outliers: probability that a pixel has a range that is uniformly random in the last 5 % before the table.
-        min_height, max_height: what lies between these heights [m] is taken for cable. None: 2.5 times the
-            noise of the range, but at least half and at most three quarters of the cable's diameter; and three radii
-            above its top.
         min_neighbours: of the eight pixels around it, how many must be taken for cable too; stray pixels have few.
         gripper_size: box at each gripper (along the cable, across, up) [m], which hides what is behind it. Its own
             points are left out, as a robot does that knows where its arms are.
@@ -56,8 +53,6 @@ class CameraConfig:
     range_noise: float = 0.002
     dropout: float = 0.05
     outliers: float = 0.001
-    min_height: float | None = None
-    max_height: float | None = None
     min_neighbours: int = 3
     gripper_size: tuple[float, float, float] = (0.05, 0.04, 0.08)
     gripper_overlap: float = 0.01
@@ -92,11 +87,10 @@ class DepthCamera:
     """
 
     def __init__(self, config: CameraConfig, chain: Discretisation):
-        if config.min_height is None and config.range_noise > 0.5 * chain.cable.diameter:
+        if config.range_noise > 0.5 * chain.cable.diameter:
             raise ValueError(
                 f"A range noise of {1e3 * config.range_noise:g} mm hides a cable of {1e3 * chain.cable.diameter:g} mm "
-                "on the table: expected at most half of that "
-                "(CameraConfig.range_noise, --noise-mm), or a min_height."
+                "on the table: expected at most half of that (CameraConfig.range_noise, --noise-mm)."
             )
         self.config, self.chain = config, chain
         self.position, self._rays = _pixels(config)
@@ -131,9 +125,10 @@ class DepthCamera:
         """
         config, random = self.config, self._random
         self._place(nodes, directions, gripper_pose)
-        radius = 0.5 * self.chain.cable.diameter
-        low = _lowest(config, self.chain) if config.min_height is None else config.min_height
-        high = self.chain.cable.diameter + 3.0 * radius if config.max_height is None else config.max_height
+        diameter, radius = self.chain.cable.diameter, 0.5 * self.chain.cable.diameter
+        # what lies between these heights is taken for cable
+        low = max(_LEAST * diameter, min(_CLEAR * config.range_noise, _VISIBLE * diameter))
+        high = diameter + 3.0 * radius
         # Where there is only table the range has a formula; noise and outliers make cable out of few of its pixels.
         rays = self._rays
         to_table = -self.position[2] / rays[:, 2]
@@ -205,12 +200,6 @@ class DepthCamera:
                 self.model, self._data, self.position, rays.ravel(), None, True, -1, geom, distance, None, count, 1e3
             )
         return geom, distance
-
-
-def _lowest(config: CameraConfig, chain: Discretisation) -> float:
-    """Height [m] above which a point is taken for cable, where the configuration states none."""
-    diameter = chain.cable.diameter
-    return max(0.5 * diameter, min(_CLEAR * config.range_noise, _VISIBLE * diameter))
 
 
 def _axes(config: CameraConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
