@@ -9,13 +9,13 @@ from scipy.signal import lfilter
 
 from cablejax.diagnose import explanation, planar_run
 from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.case import Case
+from cablejax.diagnose.case import Case, calibrated
 from cablejax.diagnose.caveats import caveats_of, silent_motions
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import NamedEffect
 from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.noise import SMALLEST, _rounding, noise_floor, still
-from cablejax.diagnose.planar_run import _worth_naming, calibrated
+from cablejax.diagnose.planar_run import _worth_naming
 from cablejax.diagnose.playback import Playback
 from diagnose_cases import evidence, holds, log_of, parts, poses, record
 
@@ -232,9 +232,11 @@ def test_caveats_on_holds_that_are_none():
     assert any("while the grippers rest, and by" in text for text in texts)
 
 
-def test_simulator_is_taken_to_be_further_off_on_a_long_cable():
-    assert calibrated(3.0).baseline == pytest.approx(3 * Calibration.baseline)
-    assert calibrated(0.4) == Calibration()
+def test_what_the_simulator_may_be_off_by_grows_with_the_cable():
+    assert calibrated(1.0) == Calibration()
+    for length in (3.0, 0.25):
+        assert calibrated(length).baseline == pytest.approx(length * Calibration.baseline)
+    assert calibrated(0.05).baseline == SMALLEST
 
 
 def test_what_stated_numbers_may_be_off_by_is_small_unless_the_cable_is_soft():

@@ -1,4 +1,7 @@
-"""One log written in other words is the same log: turned, wound, numbered from the other end, on another clock."""
+"""One log written in other words is the same log: turned, wound, numbered from the other end, on another clock.
+
+One that is similar, with another unit of length, is explained alike.
+"""
 
 import copy
 import dataclasses
@@ -6,9 +9,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cablejax.diagnose import DiagnosisError
+from cablejax.diagnose import DiagnosisError, diagnose, explanation
 from cablejax.diagnose.actuation import actuation
-from cablejax.diagnose.case import Case
+from cablejax.diagnose.belief import excess
+from cablejax.diagnose.case import Case, calibrated
+from cablejax.diagnose.fit import evaluate
 from cablejax.diagnose.recording import prepare
 from cablejax.types import GapLog
 from diagnose_cases import INTERVAL, SAMPLES, clean, log_of, record
@@ -77,6 +82,29 @@ CHANGES = {
 }
 
 
+def similar(log: GapLog, size: float) -> GapLog:
+    """The same motion of a cable of `size` times the length: its friction is `size` times, its EI `size^4` times."""
+    meta = copy.deepcopy(log.meta)
+    for name, power in {"length_m": 1, "diameter_m": 1, "bending_stiffness_n_m2": 4}.items():
+        meta["cable"][name] *= size**power
+    meta["table"]["friction_coefficient"] *= size
+    meta["keypoint_arclength_m"] = [size * mark for mark in meta["keypoint_arclength_m"]]
+    return dataclasses.replace(
+        log,
+        keypoints=size * log.keypoints,
+        gripper_pose=log.gripper_pose * np.array([size, size, 1.0], np.float32),
+        gripper_command=log.gripper_command * np.array([size, size, 1.0], np.float32),
+        meta=meta,
+    )
+
+
+def gap_over_least(log: GapLog) -> float:
+    """The nominal simulator's error over the least that counts as a gap."""
+    case, calibration = Case.of(log), calibrated(log.meta["cable"]["length_m"])
+    evidence = case.evidence(calibration)
+    return excess(evaluate(evidence, [explanation()])[0], evidence) / calibration.smallest_gap(case.noise.std.mean())
+
+
 @pytest.fixture(scope="module")
 def usual_mm():
     return gap_mm(record())
@@ -85,6 +113,40 @@ def usual_mm():
 @pytest.mark.parametrize("name", CHANGES)
 def test_the_gap_is_the_same(name, usual_mm):
     assert gap_mm(CHANGES[name](record())) == pytest.approx(usual_mm, rel=0.03)
+
+
+def test_a_short_cable_has_a_gap_where_a_long_one_has():
+    log = record(TILT)
+    assert gap_over_least(similar(log, 0.25)) == pytest.approx(gap_over_least(log), rel=0.03)
+
+
+def test_places_sizes_and_curvatures_are_sought_in_lengths_of_the_cable():
+    def priors(size: float) -> dict[str, tuple[float, ...]]:
+        log = similar(record(), size)
+        shift = np.array([3.7 * size, 0.0, 0.0], np.float32)
+        moved = dataclasses.replace(log, gripper_pose=log.gripper_pose + shift, keypoints=log.keypoints + shift[:2])
+        units = {"m": size, "1/m": 1 / size}
+        return {
+            f"{effect.name} {p.name}": (p.centre / units[p.unit], (1 if p.log else 1 / units[p.unit]) * p.scale)
+            for effect in Case.of(moved).simulator.effects
+            for p in effect.parameters
+            if p.unit in units and effect.name != "camera_similarity"
+        }
+
+    long, short = priors(1.0), priors(0.25)
+    assert {name.split()[0] for name in long} >= {"friction_patch", "obstacle", "plasticity", "gripper_slip"}
+    assert long["obstacle x_m"][0] == pytest.approx(4.4)
+    for name, prior in long.items():
+        assert short[name] == pytest.approx(prior), name
+
+
+@pytest.mark.slow
+def test_a_short_cable_is_diagnosed_like_a_long_one():
+    log = record(("table_friction", 0, (4.0, 0.0)))
+    long, short = (diagnose(similar(log, size)) for size in (1.0, 0.25))
+    assert short.verdict == long.verdict != "none"
+    assert {one.name for one in short.effects} == {one.name for one in long.effects}
+    assert set(short.equivalent[0]) == set(long.equivalent[0])
 
 
 def test_episodes_that_repeat_are_known_whatever_their_angles():

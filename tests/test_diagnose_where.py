@@ -124,6 +124,26 @@ def test_neither_the_order_of_keypoints_nor_the_frame_matters():
     assert {k: round(v, 2) for k, v in turned.frames.items()} == {k: round(v, 2) for k, v in where.frames.items()}
 
 
+def test_a_similar_cable_of_another_length_is_off_at_the_same_places_and_speeds():
+    size = 0.25
+    log, nominal = case(np.linspace(0, 5e-3, POINTS)[:, None] * np.ones(2))
+    where = localise(log, nominal, np.full(POINTS, NOISE))
+    assert {"speed: slow", "speed: fast"} <= set(where.regimes)
+    cable = {**log.meta["cable"], "length_m": size * log.meta["cable"]["length_m"]}
+    marks = [size * mark for mark in log.meta["keypoint_arclength_m"]]
+    small = dataclasses.replace(
+        log,
+        keypoints=size * log.keypoints,
+        gripper_pose=log.gripper_pose * [size, size, 1.0],
+        gripper_command=log.gripper_command * [size, size, 1.0],
+        meta={**log.meta, "cable": cable, "keypoint_arclength_m": marks},
+    )
+    there = localise(small, size * nominal, np.full(POINTS, size * NOISE))
+    for name in ("speed: fast", "curvature: high"):
+        assert there.regimes[name] == pytest.approx(size * where.regimes[name], rel=1e-5)
+    np.testing.assert_allclose(there.along_cable_mm, size * where.along_cable_mm, rtol=1e-5)
+
+
 def test_missing_keypoints_no_holds_and_a_single_episode_are_no_obstacle():
     log, nominal = case(3e-3, MOTIONS[:1])
     keypoints = log.keypoints.copy()

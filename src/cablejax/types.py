@@ -108,7 +108,7 @@ class Measurement(NamedTuple):
 
 
 ROTATION_WEIGHT = 0.15
-"""Metres that one radian of a gripper counts for where its motions are compared or added up [m/rad]."""
+"""Metres that one radian of a gripper of a cable of 1 m counts for where motions are compared or added up [m/rad]."""
 REFERENCE_STIFFNESS = Cable.bending_stiffness
 """EI of the reference cable [N m^2]."""
 REFERENCE_FRICTION = Cable.friction_coefficient * Cable.linear_density * GRAVITY

@@ -16,7 +16,7 @@ from cablejax.diagnose.actuation import Actuation, actuation
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.evidence import Evidence, repeated_motions
 from cablejax.diagnose.log_faults import steadied
-from cablejax.diagnose.noise import NoiseFloor, noise_floor
+from cablejax.diagnose.noise import SMALLEST, NoiseFloor, noise_floor
 from cablejax.diagnose.planar import PlanarCable, physics_of
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Explanation, explanation
@@ -34,11 +34,19 @@ FINE_LINKS = 65
 """Links of the nominal cable that the log is compared with."""
 
 _FRAME = 2.0
-"""What the origin of a recording is rounded to [m]: no finer than the priors of places on the table are."""
+"""What the origin of a recording is rounded to [lengths of the cable]: no finer than the priors of places are."""
 STATED = 0.01
 """Relative error that a cable's stated stiffness and friction may have without being a gap."""
 CLAMP_PROBE = 0.003
 """Small error of a clamp's angle [rad]: it moves a usual cable by about what a simulator without effect is off by."""
+
+
+def calibrated(length: float) -> Calibration:
+    """The constants for a cable of this length [m]: they were set on cables of about 1 m, and errors grow with length.
+
+    No error below the least noise is believed.
+    """
+    return Calibration(baseline=max(Calibration.baseline * length, SMALLEST))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +56,7 @@ class Case:
     Attributes:
         recording: the log after checks and repairs.
         config: the nominal cable at the resolution of the fits.
-        effects: that may be at work, as they were given: the simulator's are where the recording is.
+        effects: that may be at work, as they were given: the simulator's have the cable's size and are where it is.
         arms: how the grippers followed their commands.
         noise: floor of the recording.
         scatter: what was taken from the gripper poses so that they are smooth [m, m, rad], shape [2, 3].
@@ -122,10 +130,11 @@ class Case:
             raise DiagnosisError(
                 "The nominal simulation of this log diverges: are the poses continuous, and in metres?"
             )
-        # roughly [m]: the world's origin wherever the grippers are within a metre of it
-        place = _FRAME * np.round(np.nanmean(recording.gripper_pose[..., :2], axis=(0, 1, 2)) / _FRAME)
+        # roughly [m]: the world's origin wherever the grippers are within a length of the cable of it
+        frame = _FRAME * config.cable.length
+        place = frame * np.round(np.nanmean(recording.gripper_pose[..., :2], axis=(0, 1, 2)) / frame)
         simulator = PlanarCable(
-            effects=[effect.around(place) for effect in effects],
+            effects=[effect.sized(config.cable.length).around(place) for effect in effects],
             playback=playback,
             correction=nominal - run(playback),
             duration=float((recording.interval * recording.length).min()),

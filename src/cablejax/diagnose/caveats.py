@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from cablejax.diagnose.belief import Calibration, excused
-from cablejax.diagnose.case import STATED, Case
+from cablejax.diagnose.case import STATED, Case, calibrated
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.length import Length
@@ -61,7 +61,7 @@ def caveats_of(
             "No commissioning logs were given: the simulator's own error cannot be separated from the gap and is "
             f"assumed to be {1e3 * calibration.baseline:.2g} mm."
         )
-    if stated > Calibration.baseline:
+    if stated > calibrated(case.config.cable.length).baseline:
         caveats.append(
             f"This cable is sensitive to its stated properties: {100 * STATED:g} % more or less stiffness or friction "
             f"moves keypoints by {1e3 * stated:.2g} mm per coordinate, so only a larger gap counts."

@@ -11,7 +11,7 @@ import numpy as np
 
 from cablejax.diagnose.actuation_verdict import with_arms
 from cablejax.diagnose.belief import Calibration, excess
-from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case
+from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case, calibrated
 from cablejax.diagnose.caveats import caveats_of, contradictions, silent_motions
 from cablejax.diagnose.conclude import Conclusion, sentence
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NextMotion
@@ -23,6 +23,7 @@ from cablejax.diagnose.motion_bounds import Bounds, BoundsError
 from cablejax.diagnose.motion_design import DesignConfig
 from cablejax.diagnose.motion_judge import Judge, Objective
 from cablejax.diagnose.next_motion import next_motion, require_some_motion
+from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.reading import Reading, held, with_readings
 from cablejax.diagnose.reference import ahead_of_observations
@@ -60,8 +61,8 @@ def diagnose(
         log: of a cable on a table between two grippers; its `meta` states the cable and table believed in.
         effects: what to look for; `LIBRARY` and effects of your own.
         commissioning: logs known to have no effect: how far the simulator is off without any.
-        calibration: constants of the judgement; by default those for a cable of this length, see `calibrated`, with
-            what errors of its stated stiffness and friction make, and noise of the gripper poses; see
+        calibration: constants of the judgement; by default those for a cable of this length, see `case.calibrated`,
+            with what errors of its stated stiffness and friction make, and noise of the gripper poses; see
             `Case.stated_error` and `Case.pose_error`.
         bounds: for a next motion that is designed; None = the best of the safe motions within the default bounds.
         objective: what the next motion is to give information about.
@@ -193,16 +194,11 @@ def _following(judge: Judge, design: DesignConfig | None) -> tuple[NextMotion | 
         return None, (f"No next motion is recommended for the explanations found. {why}",)
 
 
-def calibrated(length: float) -> Calibration:
-    """The constants for a cable of this length [m]. They were set on cables of about 1 m; longer ones err by more."""
-    return Calibration(baseline=Calibration.baseline * max(1.0, length))
-
-
 def baseline_error(logs: Sequence[GapLog]) -> float:
     """Root mean square error per coordinate above the noise [m] on logs without any effect."""
     every = [Case.of(log).evidence(Calibration()) for log in logs]
     squares = [excess(evaluate(one, [explanation()])[0], one) ** 2 for one in every]
-    return max(float(np.sqrt(np.mean(squares))), 5e-5)
+    return max(float(np.sqrt(np.mean(squares))), SMALLEST)
 
 
 def _measured(case: Case, evidence: Evidence, conclusion: Conclusion) -> tuple[Gap, np.ndarray, np.ndarray]:

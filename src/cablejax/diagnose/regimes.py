@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float
 from cablejax.arrays import wrapped
 from cablejax.types import ROTATION_WEIGHT, GapLog
 
-# Grippers slower than this rest [m/s].
+# Grippers slower than this rest [m/s]: encoders do not tell slower ones from noise.
 _REST_SPEED = 1e-3
+# Grippers move fast from this on [lengths of the cable per second].
 _FAST_SPEED = 0.02
 _REVERSAL_EDGES = (0.0, 1.0, 3.0, 10.0)
 
@@ -40,19 +41,19 @@ def regimes_of(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], valid: Bool[n
         nominal: simulated keypoints [m].
         valid: samples that are no padding.
     """
+    length = float(log.meta["cable"]["length_m"])
     speed, since = np.zeros(valid.shape), np.full(valid.shape, np.nan)
-    for e, length in enumerate(log.episode_length):
-        if length < 3:
+    for e, samples in enumerate(log.episode_length):
+        if samples < 3:
             continue
-        velocity = _velocity(log.gripper_pose[e, :length], log.time[e, :length])
-        speed[e, :length] = np.linalg.norm(velocity, axis=-1).max(axis=-1)
-        since[e, :length] = _since_reversal(velocity, log.time[e, :length])
+        velocity = _velocity(log.gripper_pose[e, :samples], log.time[e, :samples], length)
+        speed[e, :samples] = np.linalg.norm(velocity, axis=-1).max(axis=-1)
+        since[e, :samples] = _since_reversal(velocity, log.time[e, :samples])
     rest = valid & (speed < _REST_SPEED)
     hold = rest if log.hold is None else valid & log.hold
-    fast = valid & (speed >= _FAST_SPEED)
+    fast = valid & (speed >= _FAST_SPEED * length)
     distance = np.linalg.norm(log.gripper_pose[:, :, 1, :2] - log.gripper_pose[:, :, 0, :2], axis=-1)
     curvature = largest_curvature(nominal, np.asarray(log.meta["keypoint_arclength_m"], float))
-    length = float(log.meta["cable"]["length_m"])
     rate = np.zeros(valid.shape)
     if valid.shape[1] > 1:
         rate[:, 1:] = np.diff(distance, axis=1) / np.maximum(np.diff(log.time, axis=1), 1e-9)
@@ -91,10 +92,12 @@ def regimes_of(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], valid: Bool[n
     return Regimes(masks={k: m for k, m in masks.items() if m.any()}, pairs=pairs, hold=hold)
 
 
-def _velocity(pose: Float[np.ndarray, "T Q 3"], time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T Q 3"]:
-    """Twists [m/s], rotation times `ROTATION_WEIGHT`."""
+def _velocity(
+    pose: Float[np.ndarray, "T Q 3"], time: Float[np.ndarray, "T"], length: float
+) -> Float[np.ndarray, "T Q 3"]:
+    """Twists [m/s], rotation times `ROTATION_WEIGHT` on a cable of this length [m]."""
     pose = pose.astype(np.float64)
-    pose[..., 2] = ROTATION_WEIGHT * np.unwrap(pose[..., 2], axis=0)
+    pose[..., 2] = ROTATION_WEIGHT * length * np.unwrap(pose[..., 2], axis=0)
     return np.gradient(pose, time, axis=0)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Discretisation
-from cablejax.effects.effect import Effect
+from cablejax.effects.effect import Effect, Parameter
 from cablejax.effects.physics import Physics
 
 
@@ -67,6 +68,31 @@ class CableEffect(Effect, abc.ABC):
         """The effect where the cable is about this place [m]: priors of places on the table move with it."""
         del place
         return self
+
+    def sized(self, length: float) -> CableEffect:
+        """The effect on a cable of this length [m]: lengths and curvatures are sought in proportion to it.
+
+        Priors and null values of parameters in m and 1/m are those of a cable of 1 m; so are their bounds, which only
+        get wider.
+        """
+        factors = [{"m": length, "1/m": 1.0 / length}.get(p.unit, 1.0) for p in self.parameters]
+        parameters = tuple(
+            dataclasses.replace(
+                p,
+                low=min(p.low, factor * p.low),
+                high=max(p.high, factor * p.high),
+                centre=factor * p.centre,
+                scale=p.scale if p.log else factor * p.scale,
+            )
+            for p, factor in zip(self.parameters, factors, strict=True)
+        )
+        null = tuple(factor * value for value, factor in zip(self.null, factors, strict=True))
+        return self._with_parameters(parameters, null)
+
+    def _with_parameters(self, parameters: tuple[Parameter, ...], null: tuple[float, ...]) -> CableEffect:
+        other = copy.copy(self)
+        vars(other).update(parameters=parameters, null=null)
+        return other
 
     def seen_from(self, parameters: Mapping[str, float], place: Sequence[float]) -> dict[str, float]:
         """Parameters by the names of the verdict in a world whose origin is this place [m]."""

@@ -44,6 +44,11 @@ class CameraSimilarity(CableEffect):
         vars(other).update(origin=(float(place[0]), float(place[1])))
         return other
 
+    def sized(self, length):
+        """A camera's place is off by as much above any cable."""
+        del length
+        return self
+
     def apply(self, physics, values, variant, config):
         """Scales, turns [rad] and shifts [m] the keypoints' frame."""
         xp = values[0].__array_namespace__()

@@ -94,25 +94,26 @@ class GivenEffect:
         Raises:
             ValueError: a parameter is out of its bounds.
         """
-        values, variant = self.effect.given(dict(self.parameters), chain)
-        if variant not in self.effect.variants:
-            known = shown(list(self.effect.variants))
-            raise ValueError(f"{self.name}: {self.effect.variant_name} is {variant}, expected one of {known}.")
+        effect = self.effect.sized(chain.cable.length)
+        values, variant = effect.given(dict(self.parameters), chain)
+        if variant not in effect.variants:
+            known = shown(list(effect.variants))
+            raise ValueError(f"{self.name}: {effect.variant_name} is {variant}, expected one of {known}.")
         bounded = []
-        for parameter, value in zip(self.effect.parameters, values, strict=True):
+        for parameter, value in zip(effect.parameters, values, strict=True):
             # verdicts round what they found at a bound
             beyond = max(parameter.low - value, value - parameter.high)
             if not beyond <= _ROUNDED * abs(value):
-                raise ValueError(f"{self.name}: {self._out_of_bounds(parameter, value, variant, chain)}")
+                raise ValueError(f"{self.name}: {self._out_of_bounds(effect, parameter, value, variant, chain)}")
             bounded.append(np.float32(min(max(value, parameter.low), parameter.high)))
-        return self.effect.apply(physics, bounded, variant, chain)
+        return effect.apply(physics, bounded, variant, chain)
 
-    def _out_of_bounds(self, parameter: Parameter, value: float, variant: int, chain: Discretisation) -> str:
+    def _out_of_bounds(
+        self, effect: CableEffect, parameter: Parameter, value: float, variant: int, chain: Discretisation
+    ) -> str:
         """What a parameter is and may be, by the name and in the unit in which it was given."""
         low, high = (
-            self.effect.reported(
-                [limit if p is parameter else p.centre for p in self.effect.parameters], variant, chain
-            )
+            effect.reported([limit if p is parameter else p.centre for p in effect.parameters], variant, chain)
             for limit in (parameter.low, parameter.high)
         )
         # one that the fit knows by another name was given by the name of the verdict that it changes

@@ -45,9 +45,9 @@ class GripperSlip(_AtGripper):
         )
 
     def starts(self, context):
-        """A slip of 1 cm at six times, through either gripper."""
+        """A slip of a hundredth of the cable at six times, through either gripper."""
         times = [context.duration * f for f in (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)]
-        return [(g, (t, -0.01)) for g in (0, 1) for t in times]
+        return [(g, (t, -0.01 * context.config.cable.length)) for g in (0, 1) for t in times]
 
     def location(self, values, variant, config):
         """The gripper's end of the cable [m] and the time [s]."""

@@ -94,8 +94,8 @@ class IntrinsicCurvature(_Section):
         return replace(physics, rest_curvature=physics.rest_curvature + values[2] * part)
 
     def starts(self, context):
-        """A section curved by 1/m at eight places along the cable."""
-        return [(0, (c, 0.15, 1.0)) for c in _CENTRES]
+        """A section curved by one over the cable's length at eight places along the cable."""
+        return [(0, (c, 0.15, 1.0 / context.config.cable.length)) for c in _CENTRES]
 
 
 class Plasticity(CableEffect):
@@ -119,8 +119,9 @@ class Plasticity(CableEffect):
     def starts(self, context):
         """Yield curvatures at five fractions of the sharpest nominal bend, each with weak and with full hardening."""
         sharpest = float(context.max_curvature.max())
+        low, high = np.array([0.3, 90.0]) / context.config.cable.length
         return [
-            (0, (float(np.clip(f * sharpest, 0.3, 90.0)), h)) for f in (0.9, 0.75, 0.6, 0.45, 0.3) for h in (0.05, 1.0)
+            (0, (float(np.clip(f * sharpest, low, high)), h)) for f in (0.9, 0.75, 0.6, 0.45, 0.3) for h in (0.05, 1.0)
         ]
 
 
@@ -143,9 +144,10 @@ class BendingHysteresis(CableEffect):
         return replace(physics, hysteresis_moment=still + values[0], hysteresis_curvature=still + values[1])
 
     def starts(self, context):
-        """Friction moments of 0.15 and 0.6 times EI per metre, each with two transition curvatures."""
-        stiffness = context.config.cable.bending_stiffness
-        return [(0, (m * stiffness, k)) for m in (0.15, 0.6) for k in (0.15, 1.0)]
+        """Friction moments of 0.15 and 0.6 times EI over the cable's length, each with two transition curvatures."""
+        cable = context.config.cable
+        moment = cable.bending_stiffness / cable.length
+        return [(0, (m * moment, k / cable.length)) for m in (0.15, 0.6) for k in (0.15, 1.0)]
 
 
 class BendingDamping(CableEffect):

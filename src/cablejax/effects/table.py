@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from dataclasses import replace
 
@@ -14,10 +13,10 @@ from cablejax.cable import Discretisation
 from cablejax.effects.base import CableEffect, Context
 from cablejax.effects.effect import Parameter
 
-# Discs tried as obstacles: of which size at most, how many, and how far apart [m].
-_LARGEST, _MOST_DISCS, _APART = 0.06, 3, 0.05
-# Of the search for them: the grid's step over the cable's length, every which sample, and how near touches [m].
-_GRID, _EVERY, _CONTACT = 0.015, 4, 6e-3
+# Discs tried as obstacles: how many, and of which size at most, how far apart [lengths of the cable].
+_MOST_DISCS, _LARGEST, _APART = 3, 0.06, 0.05
+# Of the search for them: every which sample, and the grid's step, how near touches [lengths of the cable].
+_EVERY, _GRID, _CONTACT = 4, 0.015, 6e-3
 _MOST_PLACES = 10_000
 
 
@@ -79,9 +78,7 @@ class _AtPlace(CableEffect):
             for p, shift in zip(self.parameters, shifts, strict=True)
         )
         null = tuple(value + shift for value, shift in zip(self.null, shifts, strict=True))
-        other = copy.copy(self)
-        vars(other).update(parameters=parameters, null=null)
-        return other
+        return self._with_parameters(parameters, null)
 
     def seen_from(self, parameters, place):
         """Its centre moves."""
@@ -120,7 +117,8 @@ class FrictionPatch(_AtPlace):
 
     def starts(self, context):
         """A patch three times as rough in each of the 14 squares of the table that the cable visits most."""
-        return [(0, (x, y, 0.12, 3.0)) for x, y in _swept(context, 0.14)[:14]]
+        length = context.config.cable.length
+        return [(0, (x, y, 0.12 * length, 3.0)) for x, y in _swept(context, 0.14 * length)[:14]]
 
     def reported(self, values, variant, config):
         """Centre and radius [m], and the coefficient inside instead of its ratio to the nominal one."""
@@ -215,10 +213,10 @@ class Obstacle(_AtPlace):
 
     def starts(self, context):
         """Discs that the simulated cable passes through and the observed one lies against."""
-        return [(0, disc) for disc in _in_the_way(context)]
+        return [(0, disc) for disc in _in_the_way(context, self.parameters[2])]
 
 
-def _in_the_way(context: Context) -> list[tuple[float, float, float]]:
+def _in_the_way(context: Context, size: Parameter) -> list[tuple[float, float, float]]:
     """Candidate discs (x, y, radius) [m], best first: none overlaps the observed cable at any time.
 
     Every point of a grid gets the largest such disc. It is as good as the simulated cable is deep in it, summed over
@@ -235,23 +233,23 @@ def _in_the_way(context: Context) -> list[tuple[float, float, float]]:
     simulated, observed = simulated[seen], (simulated + residual)[seen]
     low, high = simulated.min(axis=(0, 1)), simulated.max(axis=(0, 1))
     # a fit moves the disc from there: a short cable that is carried far needs no finer grid
-    step = max(_GRID * context.config.cable.length, float(np.sqrt(np.prod(high - low) / _MOST_PLACES)))
+    length = context.config.cable.length
+    step = max(_GRID * length, float(np.sqrt(np.prod(high - low) / _MOST_PLACES)))
     axes = [np.arange(begin, end + step, step) for begin, end in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     away = _distances(grid, observed)
     radius = away.min(axis=1)
-    fits = (radius > Obstacle.parameters[2].low) & (radius < _LARGEST)
+    fits = (radius > size.low) & (radius < _LARGEST * length)
     grid, away, radius = grid[fits], away[fits], radius[fits]
     depth = np.maximum(radius[:, None] - _distances(grid, simulated), 0.0)
-    against = np.exp(-(((away - radius[:, None]) / _CONTACT) ** 2))
-    size = Obstacle.parameters[2]
+    against = np.exp(-(((away - radius[:, None]) / (_CONTACT * length)) ** 2))
     prior = np.exp(-0.5 * (np.log(radius / size.centre) / size.scale) ** 2)
     score = (np.sqrt(depth) * against).sum(axis=1) * prior
     result: list[tuple[float, float, float]] = []
     for i in np.argsort(-score, kind="stable"):
         if score[i] <= 0 or len(result) == _MOST_DISCS:
             break
-        if all(np.hypot(*(grid[i] - disc[:2])) > _APART for disc in result):
+        if all(np.hypot(*(grid[i] - disc[:2])) > _APART * length for disc in result):
             result.append((float(grid[i, 0]), float(grid[i, 1]), float(radius[i])))
     return result
 
