@@ -285,6 +285,13 @@ def test_another_frame_is_refused():
         told(dataclasses.replace(log, keypoints=log.keypoints + np.float32(0.5)))
 
 
+def test_a_grasp_that_is_not_simulated_is_refused_before_the_diagnosis():
+    log = record()
+    pinned = dataclasses.replace(log, meta={**log.meta, "grasp": ["pinned", "clamped"]})
+    with pytest.raises(DiagnosisError, match=r"'meta.grasp' is \['pinned', 'clamped'\], expected .*gripper_compliance"):
+        prepare(pinned)
+
+
 def test_space_is_refused():
     log = record()
     height = np.zeros_like(log.keypoints[..., :1])

@@ -262,11 +262,43 @@ def test_a_damaged_data_set_is_answered(tmp_path):
         for broken in [*with_other_bytes(whole, 12), whole[: len(whole) // 2], b"", b"[]", b"{}"]:
             file.write_bytes(broken)
             try:
-                read_lerobot(folder)
+                found = read_lerobot(folder)
             except ValueError as error:
                 assert "set" in str(error)
+            else:
+                if file.is_relative_to(folder / "data"):
+                    assert_same(found, planar())
         file.write_bytes(whole)
     assert_same(read_lerobot(folder), planar())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda table: table.slice(0, len(table) - 2), r"has \d+ rows, but .* states \d+: rows were lost or added"),
+        (lambda table: table.drop(["hold"]), r"lacks hold, which meta/info.json states"),
+        (lambda table: with_column(table, "hold", ["False"] * len(table)), r"hold has object, expected true or false"),
+        (
+            lambda table: with_column(table, "episode_index", [9] * len(table)),
+            r"rows of episode 9, but .*counted from 0",
+        ),
+    ],
+)
+def test_a_data_set_with_other_rows_or_columns_is_refused(change, message, tmp_path):
+    needs("pyarrow")
+    import pyarrow.parquet
+
+    folder = write_lerobot(tmp_path / "set", planar())
+    data = folder / "data/chunk-000/file-000.parquet"
+    pyarrow.parquet.write_table(change(pyarrow.parquet.read_table(data)), data)
+    with pytest.raises(GapLogError, match=message):
+        read_lerobot(folder)
+
+
+def with_column(table, name, values):
+    import pyarrow
+
+    return table.set_column(table.column_names.index(name), name, pyarrow.array(values))
 
 
 def test_files_of_other_programs_are_refused(tmp_path):

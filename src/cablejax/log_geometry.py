@@ -134,7 +134,7 @@ def geometry_fault(log: GapLog) -> str | None:
 
 
 def cable_fault(log: GapLog) -> str | None:
-    """Finds keypoints that are not of a cable of the stated length between these grippers; a message, or None.
+    """Finds a grasp that is not simulated, and keypoints that no cable of this length has; a message, or None.
 
     Args:
         log: valid; between two grippers, else nothing is checked.
@@ -142,6 +142,11 @@ def cable_fault(log: GapLog) -> str | None:
     dimension = log.keypoints.shape[-1]
     if log.gripper_pose.shape[2] != 2:
         return None
+    if any(hold != "clamped" for hold in log.meta["grasp"]):
+        return (
+            f'Field \'meta.grasp\' is {log.meta["grasp"]}, expected ["clamped", "clamped"], the only grasp simulated. '
+            "State this for grippers that yield too, which a diagnosis on a table finds (`gripper_compliance`)."
+        )
     points, pose = log.keypoints[log.valid].astype(float), log.gripper_pose[log.valid].astype(float)
     grippers = pose[..., :dimension]
     near = AT_GRIPPER * min(1.0, float(log.meta["cable"]["length_m"]))

@@ -102,6 +102,15 @@ def read_lerobot(folder: str | os.PathLike[str]) -> GapLog:
         raise GapLogError(f"{folder / _LOG} is damaged: it is no `meta` of a gap log ({SCHEMA}). Export the log again.")
     with reading_export(folder):
         table = _read_table(arrow, sorted((folder / "data").glob("chunk-*/file-*.parquet")))
+        if missing := sorted(set(info["features"]) - set(table)):
+            raise GapLogError(
+                f"The data lacks {', '.join(missing)}, which meta/info.json states. Export the log again."
+            )
+        if (rows := len(table["index"])) != info["total_frames"]:
+            raise GapLogError(
+                f"The data has {rows} rows, but meta/info.json states {info['total_frames']}: rows were lost or added. "
+                "Export the log again."
+            )
         return stack_episodes(_episodes(table, info["features"], meta["motion"]), meta, holds="hold" in table)
 
 
@@ -231,7 +240,7 @@ def _write_tasks(arrow: Any, path: pathlib.Path, tasks: Sequence[str]) -> None:
 def _write(path: pathlib.Path, table: Any) -> None:
     parquet = _pyarrow("pyarrow.parquet")
     with whole_file(path) as stream:
-        parquet.write_table(table, stream, compression="snappy")
+        parquet.write_table(table, stream, compression="snappy", write_page_checksum=True)
 
 
 def _read_table(arrow: Any, paths: Sequence[pathlib.Path]) -> dict[str, np.ndarray]:
@@ -241,7 +250,7 @@ def _read_table(arrow: Any, paths: Sequence[pathlib.Path]) -> dict[str, np.ndarr
     parquet = _pyarrow("pyarrow.parquet")
     tables = []
     for path in paths:
-        with parquet.ParquetFile(path, pre_buffer=False) as file:
+        with parquet.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
             groups = [file.metadata.row_group(k) for k in range(file.metadata.num_row_groups)]
             require(sum(group.total_byte_size for group in groups), "array_bytes", f"The size of {path}")
             tables.append(file.read())
@@ -257,6 +266,13 @@ def _episodes(table: Mapping[str, np.ndarray], features: Mapping[str, Any], moti
     dimension = 2 if table["observation.state"].shape[1] == 3 * grippers else 3
     shapes = {"keypoints": (-1, dimension), "gripper_pose": (grippers, -1), "gripper_command": (grippers, -1)}
     hold = table.get("hold", np.zeros(len(table["time"]), bool))
+    if hold.dtype != bool:
+        raise GapLogError(f"The column hold has {hold.dtype}, expected true or false. Export the log again.")
+    if extra := sorted(set(table["episode_index"].tolist()) - set(range(len(motions)))):
+        raise GapLogError(
+            f"The data has rows of episode {extra[0]}, but {_LOG} names the motions of {len(motions)} episodes, "
+            "counted from 0. Export the log again."
+        )
     episodes = []
     for index, motion in enumerate(motions):
         rows = np.flatnonzero(table["episode_index"] == index)
