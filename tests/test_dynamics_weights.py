@@ -92,6 +92,22 @@ def test_descriptions_that_do_not_fit_are_refused(saved, change, message):
         load_weights(altered(saved, content=change))
 
 
+def test_a_flipped_bit_is_found_wherever_it_is(saved):
+    whole, rng = saved.read_bytes(), np.random.default_rng(0)
+    for place in rng.integers(8, len(whole), 40):
+        broken = bytearray(whole)
+        broken[place] ^= 1 << rng.integers(8)
+        saved.write_bytes(broken)
+        with pytest.raises(WeightsError, match=saved.name):
+            load_weights(saved)
+    saved.write_bytes(whole)
+    scaled = altered(saved, tensors=lambda t: t | {"decoder.rest.0.bias": t["decoder.rest.0.bias"] + np.float32(0.1)})
+    with pytest.raises(WeightsError, match=r"does not match its digest.*run the training's command again"):
+        load_weights(scaled)
+    # files of earlier versions have none
+    load_weights(altered(saved, content=lambda c: {name: part for name, part in c.items() if name != "digest"}))
+
+
 def test_a_file_that_is_something_else_is_refused(tmp_path, saved):
     (tmp_path / "text.safetensors").write_text("not tensors")
     (tmp_path / "cut.safetensors").write_bytes(saved.read_bytes()[:-100])

@@ -6,6 +6,7 @@ The file's metadata has one key, "cablejax", whose JSON object holds
     config   the `ModelConfig`, normalisation included
     info     where the weights come from: the cable (keys of the cable file), the inputs of a conditioned network in
              its data (`control.cable_inputs`), data sets and their digests, seeds, package versions, kind of machine
+    digest   SHA-256 of the tensors, config and info; the released files of version 1.0 have none
 
 and its tensors are the network's, named by their place in it: "processor.0.edge.first.1.kernel".
 """
@@ -71,7 +72,8 @@ def save_weights(
     tensors = {name: np.asarray(leaf) for name, leaf in _named(weights).items()}
     _check_tensors(tensors, _named(structure_of(model_config)[1]), f"The weights to be saved in {path}")
     content = {"schema": SCHEMA, "config": RECORDED | dataclasses.asdict(model_config), "info": dict(info)}
-    data = save(tensors, metadata={_KEY: json.dumps(content, allow_nan=False)})
+    content = json.loads(json.dumps(content, allow_nan=False))  # as it will be read
+    data = save(tensors, metadata={_KEY: json.dumps(content | {"digest": _digest(tensors, content)})})
     with whole_file(path) as stream:
         stream.write(data)
 
@@ -92,6 +94,11 @@ def load_weights(source: str | os.PathLike[str]) -> tuple[ModelConfig, nnx.Graph
     with safe_open(path, framework="numpy") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     _check_tensors(tensors, _named(expected), path)
+    if content.get("digest", digest := _digest(tensors, content)) != digest:
+        raise WeightsError(
+            f"{path} is damaged, or was changed after training: it does not match its digest. Restore it, or run the "
+            "training's command again."
+        )
     flat = nnx.to_flat_state(expected)
     leaves = [(key, variable.replace(jnp.asarray(tensors[_name(key)]))) for key, variable in flat]
     return config, graphdef, nnx.from_flat_state(leaves)
@@ -197,6 +204,16 @@ def _config_of(content: dict[str, Any], path: Path) -> ModelConfig:
         ) from error
     except ValueError as error:
         raise WeightsError(f"{path} records an impossible configuration: {error}") from error
+
+
+def _digest(tensors: Mapping[str, np.ndarray], content: Mapping[str, Any]) -> str:
+    """SHA-256 of tensors by name, and of their configuration and provenance."""
+    digest = hashlib.sha256()
+    digest.update(json.dumps([content["config"], content["info"]], sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name}{tensor.dtype}{tensor.shape}".encode())
+        digest.update(np.ascontiguousarray(tensor).tobytes())
+    return digest.hexdigest()
 
 
 def fingerprint(tree: Any) -> str:
