@@ -134,7 +134,14 @@ def test_a_verdict(verdict, tmp_path, capsys):
 
 def test_a_damaged_verdict_is_refused(tmp_path, capsys):
     made = verdict_json(diagnosis(effects=(CURVED,)))
-    for change in ({"gap": None}, {"ranking": [{"name": 3}]}, {"effects": [{"name": "x", "parameters": []}]}):
+    unlikely = {"ranking": [made["ranking"][0] | {"probability": 10**30}]}
+    for change in (
+        {"gap": None},
+        {"ranking": [{"name": 3}]},
+        {"effects": [{"name": "x", "parameters": []}]},
+        unlikely,
+        {"leftover_p": -0.1},
+    ):
         (tmp_path / "verdict.json").write_text(json.dumps(made | change))
         assert "is a damaged verdict" in refused(capsys, tmp_path / "verdict.json")
 

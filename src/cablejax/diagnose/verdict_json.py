@@ -128,14 +128,14 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
             ranking=tuple(
                 Ranked(
                     str(r["name"]),
-                    _number(r["probability"]),
+                    _chance(r["probability"]),
                     _size(r["held_out_shrinkage"]),
                     _size(r["leftover_mm"]),
                     r.get("outcome"),
                 )
                 for r in verdict["ranking"]
             ),
-            leftover_p=_number(verdict["leftover_p"]),
+            leftover_p=_chance(verdict["leftover_p"]),
             gap=Gap(
                 horizon_s=float(gap["horizon_s"]),
                 before_rmse_mm=_size(gap["before_rmse"], 1e3),
@@ -162,7 +162,7 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
             under_laws=tuple(
                 UnderLaw(
                     str(law["assumes"]),
-                    float(law["probability"]),
+                    float(_chance(law["probability"])),
                     law["verdict"],
                     tuple(_effect_of(effect) for effect in law["effects"]),
                     tuple(tuple(map(str, group)) for group in law["equivalent"]),
@@ -180,8 +180,8 @@ def _effect_of(effect: Mapping[str, Any]) -> NamedEffect:
     place = effect["location"]
     location = {name: (_number if name == "time_s" else _pair)(place[name]) for name in PLACES}
     estimates = {str(name): _estimate_of(estimate) for name, estimate in effect["parameters"].items()}
-    alike = {str(name): float(chance) for name, chance in effect.get("alike", {}).items()}
-    return NamedEffect(str(effect["name"]), _number(effect["probability"]), estimates, location, alike)
+    alike = {str(name): float(_chance(one)) for name, one in effect.get("alike", {}).items()}
+    return NamedEffect(str(effect["name"]), _chance(effect["probability"]), estimates, location, alike)
 
 
 def _estimate_of(estimate: Mapping[str, Any]) -> ParameterEstimate:
@@ -198,6 +198,13 @@ def _number(value: Any) -> Any:
     """The same value if it is a sensible number, or None where it is null. Raises TypeError otherwise."""
     if value is not None and value not in LIMITS["finite"]:
         raise TypeError(f"{shown(value)} is not a number that a diagnosis can have")
+    return value
+
+
+def _chance(value: Any) -> Any:
+    """The same value if it is a probability, or None where it is null. Raises TypeError otherwise."""
+    if value is not None and value not in LIMITS["probability"]:
+        raise TypeError(f"{shown(value)} is not a probability")
     return value
 
 
