@@ -254,6 +254,17 @@ def test_a_damaged_mcap_file_is_answered(tmp_path):
             assert "log.mcap" in str(error)
 
 
+def test_an_mcap_file_with_another_cable_than_was_written_is_refused(tmp_path):
+    needs("mcap")
+    path = write_mcap(tmp_path / "log.mcap", planar())
+    whole = path.read_bytes()
+    stated = b'"diameter_m": 0.01'
+    assert whole.count(stated) == 1
+    path.write_bytes(whole.replace(stated, stated[:-1] + b"2"))
+    with pytest.raises(GapLogError, match=r"log.mcap could not be read \(CRCValidationError"):
+        read_mcap(path)
+
+
 def test_a_damaged_data_set_is_answered(tmp_path):
     needs("pyarrow")
     folder = write_lerobot(tmp_path / "set", planar())

@@ -51,7 +51,7 @@ def write_mcap(path: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
     library, path = _mcap("mcap.writer"), pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as stream:
-        writer = library.Writer(stream)
+        writer = library.Writer(stream, enable_data_crcs=True)
         writer.start(profile="", library=_LIBRARY + __version__)
         writer.add_metadata(SCHEMA, {"meta": json.dumps(log.meta)})
         channels = {}
@@ -99,6 +99,10 @@ def read_mcap(path: str | os.PathLike[str]) -> GapLog:
     require(path.stat().st_size, "array_bytes", f"The size of {path}")
     with reading_export(path):
         with path.open("rb") as stream:
+            # a reader by topics checks the messages only, not the log's `meta`
+            for _ in library.StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
+                pass
+            stream.seek(0)
             meta, clouds, samples = _content(library, stream)
         return stack_episodes(_episodes(meta, clouds, samples), meta, holds="hold" in samples[0])
 
