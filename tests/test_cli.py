@@ -11,6 +11,8 @@ import time
 
 import pytest
 
+from cablejax.cable import Cable
+from cablejax.cable_file import write_cable
 from cablejax.cli import main
 from cablejax.commands import options
 
@@ -134,6 +136,16 @@ def test_simulate_says_its_result_as_json_and_repeats_it(tmp_path, capsys):
         assert "2 trajectories" in shown.err
     assert results[0]["complete"] == results[0]["trajectories"] == 2
     assert results[0]["digest"] == results[1]["digest"]
+
+
+def test_simulate_advises_to_train_only_where_that_is_possible(tmp_path, capsys):
+    arguments = ["simulate", "--trajectories", "1", "--steps", "2", "--links", "5"]
+    assert main([*arguments, "--out", str(tmp_path / "even cable")]) == 0
+    assert f"cablejax train --data '{tmp_path / 'even cable'}'" in capsys.readouterr().out
+    write_cable(tmp_path / "cable.toml", Cable(n_keypoints=4, marks=(0.0, 0.2, 0.7, 1.0)))
+    assert main([*arguments, "--cable", str(tmp_path / "cable.toml"), "--out", str(tmp_path / "uneven")]) == 0
+    shown = capsys.readouterr()
+    assert "cablejax train" not in shown.out and "`keypoints = 4`" in shown.err
 
 
 def test_simulate_refuses_a_folder_that_holds_something_else(tmp_path, capsys):

@@ -14,6 +14,7 @@ from cablejax.cli import main
 from cablejax.commands.cable import find_cable
 from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.schema import DatasetConfig
+from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate
 from cablejax.diagnose.verdict_json import read_verdict, verdict_json, write_verdict
 from cablejax.dynamics.weights import FILE_NAME
 from cablejax.gaplog import TARGETS, targets_of, write_gap_log
@@ -144,6 +145,30 @@ def test_a_damaged_verdict_is_refused(tmp_path, capsys):
     ):
         (tmp_path / "verdict.json").write_text(json.dumps(made | change))
         assert "is a damaged verdict" in refused(capsys, tmp_path / "verdict.json")
+
+
+def test_pages_advise_only_commands_that_accept_the_file(tmp_path, capsys):
+    softer = NamedEffect("bending_stiffness", 0.9, {"ratio": ParameterEstimate(0.5, (0.4, 0.6), "")}, {})
+    write_verdict(tmp_path / "verdict.json", diagnosis(effects=(softer,)))
+    assert "cablejax simulate --with" in view(capsys, tmp_path / "verdict.json")[1]
+    stated = json.loads((tmp_path / "verdict.json").read_text())
+    (tmp_path / "verdict.json").write_text(json.dumps(stated | {"dimension": 3}))
+    assert "cablejax simulate" not in view(capsys, tmp_path / "verdict.json", "--overwrite")[1]
+    motion = dataclasses.replace(planar(), keypoints=np.full_like(planar().keypoints, np.nan))
+    _, page = view(capsys, write_gap_log(tmp_path / "next_motion.npz", motion))
+    assert "cablejax shape --motion" in page and "cablejax diagnose" not in page
+
+    uneven = Cable(n_keypoints=4, marks=(0.0, 0.2, 0.7, 1.0))
+    write_cable(tmp_path / "cable.toml", uneven)
+    _, page = view(capsys, tmp_path / "cable.toml", "--out", tmp_path / "cable.html")
+    assert "keypoints = 4" in page and "cablejax train" not in page
+    cut = dataclasses.replace(SMALL.discretisation, cable=uneven)
+    for config, trained in ((SMALL, True), (dataclasses.replace(SMALL, discretisation=cut), False)):
+        config = dataclasses.replace(config, n_steps=3)
+        store = open_or_create(tmp_path / f"{trained}.zarr", config)
+        for shard in range(3):
+            store.write_shard(shard, block(config, shard))
+        assert ("cablejax train" in view(capsys, store.path)[1]) == trained
 
 
 def test_a_run_has_its_page(tmp_path, capsys):

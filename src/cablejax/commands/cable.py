@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import pathlib
+import shlex
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, get_args
 
@@ -46,7 +47,7 @@ class CableFile(Command):
             return cable_to_fields(cable), cable_text(cable).rstrip()
         output_file(self.out, overwrite=self.overwrite).parent.mkdir(parents=True, exist_ok=True)
         write_cable(self.out, cable)
-        text = f"The cable is in {self.out}. Edit it, then: cablejax simulate --cable {self.out}"
+        text = f"The cable is in {self.out}. Edit it, then: cablejax simulate --cable {shlex.quote(str(self.out))}"
         return {"out": str(self.out), **cable_to_fields(cable)}, text
 
 

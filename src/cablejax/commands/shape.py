@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import shlex
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
@@ -151,4 +152,4 @@ class Shape(Command):
         written = write_gap_log(out / "log.npz", log, overwrite=True)
         seconds = float(sum(log.time[e, n - 1] for e, n in enumerate(log.episode_length)))
         result = {"log": str(written), "episodes": len(log.episode_length), "seconds": seconds}
-        return result, f"{written}\n\nDiagnose it with `cablejax diagnose {written}`."
+        return result, f"{written}\n\nDiagnose it with `cablejax diagnose {shlex.quote(str(written))}`."

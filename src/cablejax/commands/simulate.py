@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import shlex
 import time
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -85,6 +86,11 @@ class Simulate(Command):
         if config.untrainable:
             names = ", ".join(config.untrainable)
             say(f"No model can be trained on data with {names}: it learns the cable, not its camera or its arms.")
+        if config.cable.marks is not None:
+            say(
+                "No model can be trained on keypoints at given arc lengths: to train on these data, write `keypoints = "
+                f"{config.cable.n_keypoints}` into the cable file in place of keypoint_arclength_m."
+            )
         begin = time.perf_counter()
         info = generate(config, place, process_index=self.process_index, process_count=self.process_count)
         seconds = time.perf_counter() - begin
@@ -96,8 +102,8 @@ class Simulate(Command):
             "seconds": round(seconds, 3),
         }
         made = f"{info.n_complete} of {config.n_trajectories} trajectories are in {place} ({seconds:.0f} s)."
-        ready = info.n_complete == config.n_trajectories and not config.untrainable
-        return result, f"{made}\nTrain on them: cablejax train --data {place}" if ready else made
+        ready = info.n_complete == config.n_trajectories and config.trainable
+        return result, f"{made}\nTrain on them: cablejax train --data {shlex.quote(str(place))}" if ready else made
 
     def dataset_config(self) -> DatasetConfig:
         """The data set that these options describe.

@@ -90,6 +90,12 @@ def sheet_of(kind: Kind, path: pathlib.Path) -> Sheet:
         return made_sheets.weights_sheet(path, str(path))
     if kind == "verdict":
         from cablejax.diagnose.verdict_json import read_verdict
+        from cablejax.effects.verdicts import effects_of_verdict
 
-        return made_sheets.verdict_sheet(read_verdict(path), str(path))
+        found, addable = read_verdict(path), True
+        try:
+            effects_of_verdict(path)
+        except ValueError:  # none is named, or of a cable in space or another simulator
+            addable = False
+        return made_sheets.verdict_sheet(found, str(path), addable=addable)
     return log_sheet.log_sheet(read_log(kind, path), str(path), "" if kind == "log" else kind)

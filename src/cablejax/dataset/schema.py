@@ -126,6 +126,11 @@ class DatasetConfig:
         return tuple(sorted(self.effect_names & OUTSIDE))
 
     @property
+    def trainable(self) -> bool:
+        """Whether models are trained on such data: without `untrainable` effects, with evenly spaced keypoints."""
+        return not self.untrainable and self.cable.marks is None
+
+    @property
     def effect_names(self) -> frozenset[str]:
         """Names of all effects that any trajectory has."""
         return frozenset(effect.name for effects in (self.effects, *self.posterior) for effect in effects)

@@ -61,7 +61,9 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
         tables=[_table(episodes, targets)],
         following=(
             *([f"Convert it back to a gap log: cablejax import {exported} {file} --out log.npz"] if exported else []),
-            f"Find out what the simulator lacks: cablejax diagnose {'log.npz' if exported else file}",
+            f"Find out what the simulator lacks: cablejax diagnose {'log.npz' if exported else file}"
+            if seen.any()
+            else f"Play it on a simulated plant: cablejax shape --motion {'log.npz' if exported else file}",
             f"View it in motion: cablejax export rerun {'log.npz' if exported else file} --out run.rrd",
         ),
         facts={

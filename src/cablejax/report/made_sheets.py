@@ -23,7 +23,7 @@ from cablejax.diagnose.judgement import effect_title, listed, share
 from cablejax.dynamics.card import network_words
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights, weights_path
 from cablejax.report.diagnosis_charts import ranking_figure
-from cablejax.report.diagnosis_sections import addable, named_effects
+from cablejax.report.diagnosis_sections import named_effects
 from cablejax.report.effect_words import between
 from cablejax.report.sheet import LETTERS_CAPTION, Sheet, cable_cards, cable_facts, letters_figure, span
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve
@@ -57,9 +57,12 @@ def store_sheet(store: Store, name: str) -> Sheet:
         figures=[] if block is None else [(_store_figure(block), _STORE_CAPTION)],
         tables=[] if block is None else [_store_ranges(block)],
         following=(
-            f"Train a model on it: cablejax train --data {shlex.quote(name)}"
-            if info.complete
-            else "Run the same command again: it resumes where it stopped.",
+            *([] if info.complete else ["Run the same command again: it resumes where it stopped."]),
+            *(
+                [f"Train a model on it: cablejax train --data {shlex.quote(name)}"]
+                if info.complete and config.trainable
+                else []
+            ),
             f"Write its cable to a file: cablejax cable --from {shlex.quote(name)} --out cable.toml",
         ),
         facts={
@@ -121,8 +124,14 @@ def weights_sheet(source: str | os.PathLike[str], name: str) -> Sheet:
 _TRAINING_CAPTION = "Loss over the training, and the open-loop error on held-out motions where it was measured."
 
 
-def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
-    """The page of a verdict; the diagnosis' own page, next to it, has more."""
+def verdict_sheet(diagnosis: Diagnosis, name: str, *, addable: bool) -> Sheet:
+    """The page of a verdict; the diagnosis' own page, next to it, has more.
+
+    Args:
+        diagnosis: as read from its file.
+        name: of the file.
+        addable: whether the named effects are those of a cable on a table, which can be simulated.
+    """
     gap = diagnosis.gap
     unit = "mm" if gap.unit == "m" else f"thousandths of {gap.unit}"
     shrinks = "not known" if gap.shrinkage is None else share(gap.shrinkage)
@@ -148,11 +157,7 @@ def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
             for effect, meaning, estimates in named_effects(diagnosis)
         ],
         following=(
-            *(
-                [f"Simulate with the named effects: cablejax simulate --with {shlex.quote(name)}"]
-                if addable(diagnosis)
-                else []
-            ),
+            *([f"Simulate with the named effects: cablejax simulate --with {shlex.quote(name)}"] if addable else []),
             *diagnosis.caveats,
         ),
         facts={

@@ -67,8 +67,14 @@ def cable_sheet(cable: Cable, name: str) -> Sheet:
         figures=[(letters_figure(cable), LETTERS_CAPTION)],
         following=(
             f"Simulate motions of it: cablejax simulate --cable {shlex.quote(name)}",
-            "Train a model on them: cablejax train --data runs/data.zarr --out runs/train",
-            "Shape it with that model: cablejax shape --target Z --weights runs/train",
+            *(
+                [
+                    "Train a model on them: cablejax train --data runs/data.zarr --out runs/train",
+                    "Shape it with that model: cablejax shape --target Z --weights runs/train",
+                ]
+                if cable.marks is None
+                else [f"To train a model, write `keypoints = {cable.n_keypoints}` in place of keypoint_arclength_m."]
+            ),
         ),
         facts=cable_facts(cable),
     )
