@@ -122,6 +122,7 @@ def test_a_take_ends_where_the_motion_has_another_name(tmp_path):
         ('unit = "mm"', 'unit = "mm"\nup = "w"', "up is 'w'"),
         ("count = 9", "count = 10", "has no column 'm10x'"),
         ("count = 9", 'count = "9"', r"\[columns\] count is '9', expected how many"),
+        ('"m{i}y"', '"m{i}x"', r"keypoint is \['m{i}x', 'm{i}x', 'm{i}z'\], expected another column for each"),
         ("count = 9", "count = 9\ngriper_0 = 3", "unknown fields .*griper_0"),
         ("count = 9", 'count = 9\ngripper_0 = ["a", "b", "c", "d", "e", "f", "g"]', "but not gripper_1"),
         ("count = 9", 'count = 9\ngripper_0 = ["a", "b", "c"]', "expected the 7 columns"),

@@ -156,6 +156,10 @@ def _keypoints(table: _Table, fields: Fields) -> tuple[np.ndarray, list[str]]:
     count = fields.take("count", int, "how many keypoints there are")
     if bad := [name for name in templates if "{i}" not in name]:
         raise ValueError(f"{fields.path}: [columns] keypoint has {bad[0]!r}, expected a name with {{i}} in it.")
+    if len(set(templates)) < len(templates):
+        raise ValueError(
+            f"{fields.path}: [columns] keypoint is {shown(templates)}, expected another column for each coordinate."
+        )
     require(count, "keypoints", f"{fields.path}: [columns] count")
     require(abs(first), "count_from_zero", f"{fields.path}: [columns] first")
     names = [name.replace("{i}", str(i)) for i in range(first, first + count) for name in templates]
