@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pathlib
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from cablejax.commands.runs import Job
 from cablejax.control.shaping import load_model
 from cablejax.control.targets import make_target
 from cablejax.simulate.plant import PlantConfig
+from cablejax.text_file import write_json
 from cli_cases import made_up_run, small_model
 
 TARGET = make_target("U")
@@ -102,9 +104,28 @@ def test_parts_of_other_settings_are_refused_or_replaced(tmp_path):
 
 
 def test_input_that_is_refused_leaves_the_folder_free(tmp_path):
-    with pytest.raises(ValueError, match="no good"), unfinished(tmp_path, SETTINGS, overwrite=False):
-        raise ValueError("no good")
-    assert list(tmp_path.iterdir()) == []
+    for out in (tmp_path, tmp_path / "new"):
+        with pytest.raises(ValueError, match="no good"), unfinished(out, SETTINGS, overwrite=False):
+            raise ValueError("no good")
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_kill_while_progress_is_removed_leaves_finished_results_finished(tmp_path, monkeypatch):
+    unlink = pathlib.Path.unlink
+
+    def killed(path, **_):
+        unlink(path)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), unfinished(tmp_path, SETTINGS, overwrite=False) as parts:
+        write_json(parts.state, {"rounds": 3})
+        (tmp_path / "report.html").write_text("whole")
+        monkeypatch.setattr(pathlib.Path, "unlink", killed)
+    monkeypatch.undo()
+    assert parts.folder.exists()
+    with pytest.raises(UsageError, match="is not empty"), unfinished(tmp_path, SETTINGS, overwrite=False):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
 def test_input_that_is_refused_leaves_finished_results_finished(tmp_path):

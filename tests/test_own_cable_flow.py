@@ -103,6 +103,8 @@ def test_data_sets_of_different_cables_are_not_mixed(folder, capsys):
     stores = [str(folder / "data.zarr"), str(folder / "stiff.zarr")]
     assert main(["train", "--data", *stores, "--out", str(folder / "mixed"), "--preset", "smoke"]) == 2
     assert "different cables: bending_stiffness_n_m2 is 0.1 and 0.05" in capsys.readouterr().err
+    assert main(["train", "--data", stores[0], stores[0], "--out", str(folder / "mixed"), "--preset", "smoke"]) == 2
+    assert "data.zarr twice: its trajectories would count twice" in capsys.readouterr().err
 
 
 def test_an_effect_without_all_of_its_parameters_is_refused(folder, capsys):

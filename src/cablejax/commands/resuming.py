@@ -48,8 +48,8 @@ class Parts:
         Raises:
             UsageError: the folder is not one that a command made, or its settings cannot be read.
         """
-        # a kill may leave settings that were never finished
-        if not self.folder.exists() or (self.folder.is_dir() and self._files() <= {f"{_SETTINGS}{DRAFT}"}):
+        # a kill may leave settings that were never finished, or progress of results that were
+        if not self.folder.exists() or (self.folder.is_dir() and self._left()):
             return None
         try:
             found = read_json(self.folder / _SETTINGS)
@@ -106,15 +106,27 @@ class Parts:
 
     def remove(self) -> None:
         """Deletes the command's progress, and the folder unless it holds something else."""
+        # without its settings the command has ended
+        with contextlib.suppress(FileNotFoundError):
+            (self.folder / _SETTINGS).replace(self.folder / f"{_SETTINGS}{DRAFT}")
         self._discard()
         with contextlib.suppress(OSError):
             self.folder.rmdir()
 
     def _discard(self) -> None:
-        # the settings last: until then the same command goes on
-        for pattern in (f"*{_RUN}", _STATE, _SETTINGS):
-            for file in (*self.folder.glob(f"{pattern}{DRAFT}"), *self.folder.glob(pattern)):
-                file.unlink()
+        for name in self._own():
+            (self.folder / name).unlink()
+
+    def _left(self) -> bool:
+        """Whether nothing is there but what a kill left of a command that had not begun, or that had ended."""
+        files, draft = self._files(), f"{_SETTINGS}{DRAFT}"
+        return not files or (draft in files and _SETTINGS not in files and set(self._own()) == files)
+
+    def _own(self) -> list[str]:
+        """The command's files, the settings last: until they are gone the same command goes on."""
+        patterns = (f"*{_RUN}", _STATE, _SETTINGS)
+        every = [self.folder.glob(name) for pattern in patterns for name in (f"{pattern}{DRAFT}", pattern)]
+        return [file.name for files in every for file in files]
 
 
 @contextlib.contextmanager
@@ -133,7 +145,7 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
         UsageError: the folder holds other results and `overwrite` is false, or is a file.
         ValueError: another process is at work in the folder.
     """
-    parts = Parts(out / "parts", settings)
+    parts, new = Parts(out / "parts", settings), not out.exists()
     differing = parts.differing()
     begun = differing == []
     if not begun:
@@ -144,7 +156,7 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
                 "another folder with --out, or add --overwrite."
             )
         if differing is None and parts.folder.is_dir():
-            parts.remove()  # nothing but what a kill left of the settings
+            parts.remove()  # nothing but what a kill left
         output_folder(out, overwrite=overwrite)
         parts.folder.mkdir(exist_ok=True)
     with sole_writer(parts.folder):
@@ -158,6 +170,8 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
             # input that is refused before anything was made of it leaves the folder as it was
             if parts.empty and _stamps(out) == before:
                 parts.remove()
+                if new and not any(out.iterdir()):
+                    out.rmdir()
             raise
         parts.remove()
 

@@ -134,6 +134,10 @@ class Train(Command):
 
         if not stores:
             raise UsageError("--data names no data set, expected at least one.")
+        places = [path.resolve() for path in self.data]
+        for path, place in zip(self.data, places, strict=True):
+            if places.count(place) > 1:
+                raise UsageError(f"--data names {path} twice: its trajectories would count twice. Name it once.")
         first = stores[0]
         if first.config.cable.marks is not None:
             raise UsageError(
