@@ -7,6 +7,8 @@ For each of the 22 effects the plant executes nine motions. Six of them are the 
 other three are held out, without noise. The effects of `verdict.json` are then added to the engine that makes training
 data, as `cablejax simulate --with verdict.json --engine chain` does, and the held-out commands are replayed open loop,
 with and without them. `floor` is the engine's error where neither has an effect: the plant is another simulator.
+
+The log is diagnosed once more in other units of length, as one of a short and one of a long cable that move alike.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from jaxtyping import Float
 from blind.motions import INTERVAL, Commands, draw_motion
 from blind.rod import arch
 from cablejax.cable import Discretisation
-from cablejax.diagnose import diagnose, write_verdict
+from cablejax.diagnose import CableDiagnosis, diagnose, write_verdict
 from cablejax.effects.given import GivenEffect, parse_effect, with_effects
 from cablejax.effects.physics import nominal_physics
 from cablejax.effects.verdicts import effects_of_verdict
@@ -37,11 +39,13 @@ from cablejax.types import GapLog
 from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
 from rows import Rows, made_on
-from staged import EFFECTS
+from staged import EFFECTS, similar
 
 LOGGED = ("approach_s", "mirror_approach_s", "overload_return", "translation", "ramp_hold", "taut")
 HELD_OUT = ("approach_u", "overload_return", "taut")
 SEED, NOISE = 24, 1e-3
+SIZES = (0.25, 4.0)
+"""Lengths of the similar cables [m]; that of the plant is 1 m."""
 PLANT = Discretisation(n_links=24, dimension=3, timestep=0.005)
 ENGINE = Discretisation()
 
@@ -86,6 +90,13 @@ def error_mm(held_out: list[Commands], truth: list[np.ndarray], effects: tuple[G
     return float(1e3 * np.sqrt(np.mean(np.concatenate([o.ravel() for o in off]) ** 2)))
 
 
+def said(diagnosis: CableDiagnosis) -> dict[str, Any]:
+    """Verdict, named effects and the whole set."""
+    named = [effect.name for effect in diagnosis.effects]
+    every = sorted({*named, *(name for group in diagnosis.equivalent for name in group)})
+    return {"verdict": diagnosis.verdict, "named": named, "set": every}
+
+
 def examine(text: str) -> dict[str, Any]:
     """The row of one staged effect, or of none ("none")."""
     effects = () if text == "none" else (parse_effect(text),)
@@ -102,11 +113,9 @@ def examine(text: str) -> dict[str, Any]:
         with tempfile.TemporaryDirectory() as folder:
             added = effects_of_verdict(write_verdict(pathlib.Path(folder) / "verdict.json", diagnosis))
         after = error_mm(held_out, truth, added)
-    named = [effect.name for effect in diagnosis.effects]
     return {
-        "verdict": diagnosis.verdict,
-        "named": named,
-        "set": sorted({*named, *(name for group in diagnosis.equivalent for name in group)}),
+        **said(diagnosis),
+        "similar": {f"{size:g}": said(diagnose(similar(log, size))) for size in SIZES},
         "added": [str(effect) for effect in added],
         "fitting_shrinkage": diagnosis.gap.shrinkage,
         "before_mm": before,
@@ -118,13 +127,16 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
     """The table, with how many of the staged effects are in the set, and the median of the shrinkage."""
     by_name = {row["effect"]: row for row in rows}
     floor = by_name["none"]["before_mm"] if "none" in by_name else 0.0
-    table, hits, ratios = [], 0, []
+    table, hits, ratios, alike = [], 0, [], dict.fromkeys((f"{size:g}" for size in SIZES), 0)
     for text in EFFECTS:
         row = by_name.get(text)
         if row is None:
             continue
-        hit = text.partition(":")[0] in row["set"]
+        name = text.partition(":")[0]
+        hit = name in row["set"]
         hits += hit
+        for size, other in row["similar"].items():
+            alike[size] += name in other["set"]
         gap, left = row["before_mm"] ** 2 - floor**2, row["after_mm"] ** 2 - floor**2
         shrinkage = 1 - left / gap if gap > floor**2 else None
         fitting = row["fitting_shrinkage"]
@@ -136,6 +148,7 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
                 row["verdict"],
                 ", ".join(row["named"]) or "-",
                 "yes" if hit else "no",
+                *("yes" if name in other["set"] else "no" for other in row["similar"].values()),
                 f"{row['before_mm']:.2f}",
                 f"{row['after_mm']:.2f}",
                 "not resolved" if shrinkage is None else f"{shrinkage:.2f}",
@@ -147,6 +160,7 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
         "verdict",
         "named",
         "in the set",
+        *(f"at {size:g} m" for size in SIZES),
         "before [mm]",
         "after [mm]",
         "shrinkage",
@@ -156,6 +170,9 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
     lines = [
         f"{hits} of {len(table)} staged effects are in the reported set. The gap shrinks in the engine that makes data",
         f"by {share} times as much as in the fitting simulator (median of {len(ratios)} effects).",
+        "",
+        "The same logs in other units of length, those of cables that move alike: the effect is in the set of",
+        f"{' and '.join(f'{count} of {len(table)} at {size} m' for size, count in alike.items())}.",
         "",
         f"One log each, six motions, {1e3 * NOISE:g} mm noise, seed {SEED}. Errors are root mean squares per",
         f"coordinate on three held-out motions without noise. The floor, {floor:.2f} mm, is the engine's error",

@@ -1,5 +1,14 @@
 """Every effect of the library, large enough to matter to a cable of the reference kind on a plant of its own."""
 
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+import numpy as np
+
+from cablejax.types import GapLog
+
 EFFECTS = (
     "bending_stiffness:ratio=0.4",
     "stiffness_profile:centre_m=0.3,width_m=0.25,ratio=0.3",
@@ -24,3 +33,23 @@ EFFECTS = (
     "camera_lag:time_s=0.4",
     "obstacle:x_m=0.45,y_m=0.33,radius_m=0.03",
 )
+
+
+def similar(log: GapLog, size: float) -> GapLog:
+    """The same motion of a cable of `size` times the length, in the same time.
+
+    Its friction is `size` times and its EI `size^4` times as large. So is the sine of a tilt `size` times, and an axial
+    stiffness `size^2` times.
+    """
+    meta = copy.deepcopy(log.meta)
+    for name, power in {"length_m": 1, "diameter_m": 1, "bending_stiffness_n_m2": 4}.items():
+        meta["cable"][name] *= size**power
+    meta["table"]["friction_coefficient"] *= size
+    meta["keypoint_arclength_m"] = [size * mark for mark in meta["keypoint_arclength_m"]]
+    return dataclasses.replace(
+        log,
+        keypoints=size * log.keypoints,
+        gripper_pose=log.gripper_pose * np.array([size, size, 1.0], np.float32),
+        gripper_command=log.gripper_command * np.array([size, size, 1.0], np.float32),
+        meta=meta,
+    )

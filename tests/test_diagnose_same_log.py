@@ -17,6 +17,7 @@ from cablejax.diagnose.fit import evaluate
 from cablejax.diagnose.recording import prepare
 from cablejax.types import GapLog
 from diagnose_cases import INTERVAL, SAMPLES, clean, log_of, record
+from staged import similar
 
 TILT = ("gravity_tilt", 0, (0.12, -0.05))
 
@@ -80,22 +81,6 @@ CHANGES = {
     "marked elsewhere": lambda log: marked_elsewhere(),
     "thick": thick,
 }
-
-
-def similar(log: GapLog, size: float) -> GapLog:
-    """The same motion of a cable of `size` times the length: its friction is `size` times, its EI `size^4` times."""
-    meta = copy.deepcopy(log.meta)
-    for name, power in {"length_m": 1, "diameter_m": 1, "bending_stiffness_n_m2": 4}.items():
-        meta["cable"][name] *= size**power
-    meta["table"]["friction_coefficient"] *= size
-    meta["keypoint_arclength_m"] = [size * mark for mark in meta["keypoint_arclength_m"]]
-    return dataclasses.replace(
-        log,
-        keypoints=size * log.keypoints,
-        gripper_pose=log.gripper_pose * np.array([size, size, 1.0], np.float32),
-        gripper_command=log.gripper_command * np.array([size, size, 1.0], np.float32),
-        meta=meta,
-    )
 
 
 def gap_over_least(log: GapLog) -> float:
