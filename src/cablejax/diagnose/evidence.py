@@ -14,12 +14,13 @@ from jaxtyping import Float, Int
 
 from cablejax.arrays import positions_at
 from cablejax.diagnose.protocol import Explanation, Simulator
-from cablejax.types import ROTATION_WEIGHT
 
 _ALIKE = 0.05
 """Motions whose gripper poses differ by less than this share of the cable's length, root mean square, are one."""
 _FOLDS = 6
 """Parts of the episodes that are held out one after the other, at most."""
+_ARM = 0.15
+"""Share of the cable's length that a radian of a gripper counts for there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,8 +146,7 @@ def repeated_motions(
     place = np.full((len(interval), len(clock), 2, 3), np.nan)
     for row, own, pose in zip(place, interval, gripper_pose, strict=True):
         within = clock <= last * own + 1e-9
-        weight = [1.0, 1.0, ROTATION_WEIGHT * length]
-        row[within] = positions_at(clock[within], own * np.arange(last + 1), pose) * weight
+        row[within] = positions_at(clock[within], own * np.arange(last + 1), pose) * [1.0, 1.0, _ARM * length]
     first, samples = np.arange(len(place)), np.isfinite(place).all(axis=(2, 3)).sum(axis=1)
     for e in range(1, len(place)):
         square = ((place[:e] - place[e]) ** 2).sum(axis=(2, 3))
