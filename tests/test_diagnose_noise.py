@@ -201,16 +201,17 @@ def test_holds_in_which_the_grippers_move_are_none():
     """Wrong flags would take the motion for noise, and hide any gap."""
     pose = np.stack([poses(motion, SAMPLES) for motion in ("approach", "mirror", "translation", "ramp_hold")])
     everywhere = np.ones((EPISODES, SAMPLES), bool)
-    kept = still(everywhere, pose)
+    kept = still(everywhere, pose, 1.0)
+    np.testing.assert_array_equal(still(everywhere, 0.25 * pose, 0.25), kept)
     keypoints = moving() + white(1e-3)
     assert kept.mean() < 0.5 and noise_floor(keypoints, everywhere).std.max() > 0.01
-    np.testing.assert_allclose(noise_floor(keypoints, still(everywhere, pose)).rapid, 1e-3, rtol=0.05)
+    np.testing.assert_allclose(noise_floor(keypoints, still(everywhere, pose, 1.0)).rapid, 1e-3, rtol=0.05)
     rest, flags = held()
-    np.testing.assert_array_equal(still(flags, np.repeat(rest[:, :, :2, :1], 3, axis=-1)), flags)
+    np.testing.assert_array_equal(still(flags, np.repeat(rest[:, :, :2, :1], 3, axis=-1), 1.0), flags)
     # a gripper that lags arrives within a hold
     late = np.zeros((1, 60, 2, 3))
     late[0, :3, 0, 0] = [0.015, 0.01, 0.005]
-    assert still(np.ones((1, 60), bool), late).all()
+    assert still(np.ones((1, 60), bool), late, 1.0).all()
 
 
 def test_keypoints_that_are_seen_in_every_third_sample_only():

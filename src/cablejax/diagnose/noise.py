@@ -14,7 +14,8 @@ from cablejax.arrays import stretches
 # Shortest hold that is used, in samples.
 _SHORTEST_HOLD = 10
 _LAGS = 5
-# A gripper that is so far from where it is for most of a hold moves the cable [m]: further than one goes that lags.
+# A gripper that is so far from where it is for most of a hold moves the cable [lengths of it]: further than one goes
+# that lags.
 _MOVED = 0.02
 # Of longer holds [samples] a line takes next to nothing.
 _LONG = 300
@@ -118,13 +119,15 @@ def _rounding(keypoints) -> float:
     return step / math.sqrt(12.0) if off < 0.02 + 10.0 * _REPEATED * largest / step else 0.0
 
 
-def still(hold: Bool[np.ndarray, "E T"], gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Bool[np.ndarray, "E T"]:
-    """The samples of holds in which the measured grippers rest: the motion of a moved cable is not noise."""
+def still(
+    hold: Bool[np.ndarray, "E T"], gripper_pose: Float[np.ndarray, "E T 2 3"], length: float
+) -> Bool[np.ndarray, "E T"]:
+    """The samples of holds in which the grippers of a cable of this length [m] rest: motion is not noise."""
     kept = np.zeros_like(hold)
     for row, flags, poses in zip(kept, hold, gripper_pose[..., :2], strict=True):
         for begin, end in stretches(flags):
             there = poses[begin:end]
-            row[begin:end] = np.abs(there - np.median(there, axis=0)).max(axis=(1, 2)) < _MOVED
+            row[begin:end] = np.abs(there - np.median(there, axis=0)).max(axis=(1, 2)) < _MOVED * length
     return kept
 
 

@@ -134,7 +134,7 @@ def prepare(log: GapLog) -> Recording:
         pose[e, n:], command[e, : n - 1] = episode.gripper_pose[-1], episode.gripper_command[: n - 1]
         # both grippers by the same whole turns, so that an episode which repeats another one is known by its angles
         pose[e, ..., 2] += 2 * np.pi * np.round((pose[0, 0, 0, 2] - pose[e, 0, 0, 2]) / (2 * np.pi))
-    marked, hold = hold, still(hold, pose)
+    marked, hold = hold, still(hold, pose, float(log.meta["cable"]["length_m"]))
     if wrong := int((marked & ~hold).sum()):
         caveats.append(
             f"{wrong} of {int(marked.sum())} samples are marked as holds although the grippers move. They are not used "
