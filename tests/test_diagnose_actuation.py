@@ -8,6 +8,7 @@ import pytest
 from cablejax.diagnose import Calibration, explanation
 from cablejax.diagnose.actuation import actuation
 from cablejax.diagnose.actuation_verdict import with_arms
+from cablejax.diagnose.case import calibrated
 from cablejax.diagnose.conclude import Conclusion, sentence
 from cablejax.diagnose.diagnosis import EffectValues
 from cablejax.diagnose.fit import Fit
@@ -176,6 +177,17 @@ def test_probabilities_are_those_of_errors_on_motions_that_no_fit_has_seen(fault
     assert conclusion.verdict == "named" and {effect.name for effect in conclusion.effects} == names
     assert all(0.95 < effect.probability <= 1.0 for effect in conclusion.effects)
     assert sum(ranked.probability for ranked in conclusion.ranking) == pytest.approx(1.0)
+
+
+def test_arms_err_by_as_much_with_a_short_cable():
+    wanted = np.stack([poses(m) for m in MOTIONS])
+    wave = 4e-4 * np.sin(0.3 * np.arange(wanted.shape[1]))[None, :, None, None] * [1.0, 1.0, 0.0]
+    shape = np.full(len(wanted), INTERVAL), np.full(len(wanted), wanted.shape[1])
+    result = actuation(wanted + wave, commands(), *shape, np.arange(len(wanted)), np.full(len(wanted), True))
+    assert result.deviates and not result.effects
+    for length in (1.0, 0.25):
+        assert with_arms(NOTHING, result, calibrated(length), length).verdict == "none"
+    assert with_arms(NOTHING, result, calibrated(0.25)).verdict == "unknown"
 
 
 def test_a_deviation_that_shows_in_one_motion_only_makes_nothing_certain():

@@ -18,8 +18,13 @@ from cablejax.diagnose.posterior import POSTERIOR, QUANTILE
 from cablejax.effects.given import EFFECTS
 
 
-def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration) -> Conclusion:
-    """Adds the arms' effects to the verdict on the cable."""
+def negligible(calibration: Calibration, length: float) -> float:
+    """Deviation of the arms that counts as none [m]. With a cable shorter than 1 m arms err by no less."""
+    return calibration.smallest_gap(0.0) / min(length, 1.0)
+
+
+def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration, length: float = 1.0) -> Conclusion:
+    """Adds the arms' effects to the verdict on a cable of this length [m]."""
     if not arms.deviates:
         return conclusion
     scores = _scores(arms, calibration)
@@ -39,11 +44,11 @@ def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration)
         for chance, (name, (left, unseen)) in zip(among_singles, arms.alone.items(), strict=True)
     ]
     changed: dict[Verdict, Verdict] = {}
-    if named and arms.explained(calibration.smallest_gap(0.0)):
+    if named and arms.explained(negligible(calibration, length)):
         changed = {"none": "named", "unknown": "named+unknown"}
     elif named:
         changed = dict.fromkeys(get_args(Verdict), "named+unknown")
-    elif arms.strays(calibration.smallest_gap(0.0)):
+    elif arms.strays(negligible(calibration, length)):
         changed = {"none": "unknown", "named": "named+unknown", "ambiguous": "named+unknown"}
     share = 1 - (arms.leftover / arms.deviation) ** 2
     of_cable = conclusion.posterior or ((),) * POSTERIOR

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from cablejax.diagnose.actuation_verdict import negligible
 from cablejax.diagnose.belief import Calibration, excused
 from cablejax.diagnose.case import STATED, Case, calibrated
 from cablejax.diagnose.conclude import Conclusion
@@ -72,7 +73,7 @@ def caveats_of(
             f"{1e3 * case.scatter[:, 2].max():.2g} mrad from one sample to the next. They were smoothed, since this "
             "scatter would shake the simulated cable."
         )
-    if case.arms.strays(calibration.smallest_gap(0.0)):
+    if case.arms.strays(negligible(calibration, case.config.cable.length)):
         caveats.append(
             f"The measured poses deviate from the commanded ones by {1e3 * case.arms.deviation:.3g} mm (root mean "
             "square), and neither a gain nor a lag explains that. Check the frame and the units of gripper_command, "

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.diagnose.actuation_verdict import with_arms
+from cablejax.diagnose.actuation_verdict import negligible, with_arms
 from cablejax.diagnose.belief import Calibration, excess
 from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case, calibrated
 from cablejax.diagnose.caveats import caveats_of, contradictions, silent_motions
@@ -78,7 +78,7 @@ def diagnose(
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
     log, case, evidence, found, conclusion, length, taken = _read(log, case, calibration, progress)
-    alone, conclusion = conclusion, with_arms(conclusion, case.arms, calibration)
+    alone, conclusion = conclusion, with_arms(conclusion, case.arms, calibration, case.config.cable.length)
 
     progress("fitting without each episode in turn")
     gap, reference, after = _measured(case, evidence, conclusion)
@@ -96,7 +96,7 @@ def diagnose(
     caveats = [*contradictions(rounds), *silent_motions(evidence, conclusion, calibration)]
     caveats += [*caveats_of(case, calibration, length, stated, commissioned=bool(commissioning)), *none_kept]
     fields = Examined(evidence, found, conclusion, reference, after, gap).fields()
-    if case.arms.strays(calibration.smallest_gap(0.0)) and alone.verdict in _ARMS_TOO:
+    if case.arms.strays(negligible(calibration, case.config.cable.length)) and alone.verdict in _ARMS_TOO:
         # what is left of the gap is theirs: not a share that right explanations leave, nor for an unknown cause to take
         fields |= {"sentence": _ARMS_TOO[alone.verdict].format(sentence(alone, None)), "leftover_p": None}
     if rounds is not None and rounds.contradictory:
