@@ -117,3 +117,14 @@ def test_the_end_of_a_short_cable_is_nearer_to_its_gripper():
     short = dataclasses.replace(still, keypoints=np.concatenate([points[:, :1], points[:, :-1]], axis=1))
     moved = gap_log_from_episodes([still], cable, source="test")
     assert "Keypoint N - 1 is 0.05" in str(cable_fault(dataclasses.replace(moved, keypoints=short.keypoints[None])))
+
+
+def test_the_ends_of_a_long_cable_may_be_as_far_from_their_grippers_in_lengths_of_the_cable():
+    cable = Cable(length=4.0, n_keypoints=9)
+    pose = np.tile([[0.0, 0.0, 0.4], [3.5, 0.0, -0.4]], (5, 1, 1))
+    points = np.tile(elastica(pose[0], cable.length, cable.keypoint_arclength), (5, 1, 1))
+    for off, words in ((0.3, "None"), (0.5, "Keypoint 0 is 0.50 m from gripper 0")):
+        seen = Episode(
+            "rest", 0.1 * np.arange(5), points + np.array([0.0, off]), pose, np.zeros((5, 2, 3)), np.zeros(5, bool)
+        )
+        assert words in str(cable_fault(gap_log_from_episodes([seen], cable, source="test")))

@@ -18,7 +18,7 @@ INWARDS = np.radians(120.0)
 MOVED = 0.02
 """Motion of a gripper, in lengths of the cable, in which keypoints that are held by it move too."""
 AT_GRIPPER = 0.1
-"""Largest median distance of an end's keypoint from its gripper [m], and in lengths of the cable."""
+"""Largest median distance of an end's keypoint from its gripper, in lengths of the cable."""
 BESIDE = 0.02
 """Largest median distance of an end's keypoint from the x axis of its gripper in space [m]."""
 ASKEW = np.radians(60.0)
@@ -149,7 +149,7 @@ def cable_fault(log: GapLog) -> str | None:
         )
     points, pose = log.keypoints[log.valid].astype(float), log.gripper_pose[log.valid].astype(float)
     grippers = pose[..., :dimension]
-    near = AT_GRIPPER * min(1.0, float(log.meta["cable"]["length_m"]))
+    near = AT_GRIPPER * float(log.meta["cable"]["length_m"])
     for gripper, (end, name) in enumerate(((0, "0"), (-1, "N - 1"))):
         seen = np.isfinite(points[:, end]).all(axis=-1)
         if not seen.any():
