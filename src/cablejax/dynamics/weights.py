@@ -207,13 +207,9 @@ def _config_of(content: dict[str, Any], path: Path) -> ModelConfig:
 
 
 def _digest(tensors: Mapping[str, np.ndarray], content: Mapping[str, Any]) -> str:
-    """SHA-256 of tensors by name, and of their configuration and provenance."""
-    digest = hashlib.sha256()
-    digest.update(json.dumps([content["config"], content["info"]], sort_keys=True).encode())
-    for name, tensor in sorted(tensors.items()):
-        digest.update(f"{name}{tensor.dtype}{tensor.shape}".encode())
-        digest.update(np.ascontiguousarray(tensor).tobytes())
-    return digest.hexdigest()
+    """SHA-256 of the fingerprint of tensors in the order of their names, their configuration and provenance."""
+    of_all = [content["config"], content["info"], fingerprint(dict(tensors))]
+    return hashlib.sha256(json.dumps(of_all, sort_keys=True).encode()).hexdigest()
 
 
 def fingerprint(tree: Any) -> str:
