@@ -117,6 +117,14 @@ def test_the_cable_is_found_in_files_and_logs(cable, tmp_path):
         assert find_cable(tmp_path / name) == cable, name
 
 
+def test_a_log_whose_cable_cannot_be_simulated_is_refused_by_name(tmp_path):
+    log = gap_log_from_episodes([at_rest(OTHER)], OTHER, source="test")
+    log = dataclasses.replace(log, meta={**log.meta, "grasp": ["pinned", "clamped"]})
+    write_gap_log(tmp_path / "pinned.npz", log)
+    with pytest.raises(ValueError, match=r"pinned\.npz: .*grasp.*pinned"):
+        find_cable(tmp_path / "pinned.npz")
+
+
 def test_the_cable_of_an_old_verdict_is_that_of_its_log(tmp_path):
     """Verdicts did not state their cable before."""
     (tmp_path / "verdict.json").write_text('{"schema": "cablejax-verdict/1", "verdict": "none"}')

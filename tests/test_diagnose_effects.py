@@ -84,6 +84,12 @@ def test_an_effect_given_twice_acts_twice_or_is_refused(effect):
     assert same != effect.alone
 
 
+@pytest.mark.parametrize("number", ["1_0", "0x2", "nan", ""])
+def test_a_parameter_is_a_plain_number(number):
+    with pytest.raises(ValueError, match="not of the form parameter=number with a finite number"):
+        parse_effect(f"bending_stiffness:ratio={number}")
+
+
 def test_a_time_is_given_once():
     with pytest.raises(ValueError, match="has a time twice, expected from_s and until_s once"):
         parse_effect("bending_stiffness:ratio=2,from_s=1,from_s=2")

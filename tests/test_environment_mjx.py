@@ -51,6 +51,7 @@ def test_it_is_gymnasiums_environment():
         observation, reward, terminated, _, info = stateful.step(action)
         assert float(state.done) == terminated == 0.0
         np.testing.assert_allclose(state.reward, reward, atol=1e-5)
+        np.testing.assert_allclose(state.info["executed_action"], info["executed_action"].ravel(), atol=1e-5)
 
 
 def test_the_grippers_stay_within_the_same_limits():

@@ -206,8 +206,14 @@ def test_the_quaternion_that_is_none_is_reported(tmp_path):
 
 
 def test_keypoints_in_the_plane_lie_on_a_table(tmp_path):
-    with pytest.raises(ValueError, match="friction coefficient is missing"):
+    with pytest.raises(ValueError, match=r"layout\.toml: .*friction coefficient is missing"):
         import_csv(*written(tmp_path, in_the_plane(), PLANAR.replace("[table]\nfriction_coefficient = 0.1\n", "")))
+
+
+def test_numbers_that_no_cable_has_are_those_of_the_layout(tmp_path):
+    in_grams = PLANAR.replace("per_m = 0.08", "per_m = 80")
+    with pytest.raises(ValueError, match=r"layout\.toml: .*no material exceeds"):
+        import_csv(*written(tmp_path, in_the_plane(), in_grams))
 
 
 def test_grippers_that_do_not_hold_the_cable_are_refused(tmp_path):

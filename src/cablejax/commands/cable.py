@@ -80,7 +80,11 @@ def find_cable(source: str | pathlib.Path | None) -> Cable:
         return cable_of_weights(path)
     from cablejax.cable_file import cable_of_log
 
-    return cable_of_log(recorded(pathlib.Path(source))[0])
+    log = recorded(pathlib.Path(source))[0]
+    try:
+        return cable_of_log(log)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
 
 
 def cable_of_verdict(path: pathlib.Path) -> Cable | None:

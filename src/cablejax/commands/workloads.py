@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import os
 import pathlib
 import tempfile
 import time
@@ -22,6 +21,7 @@ from cablejax.commands.options import say
 from cablejax.control.batched import BatchRun, for_each_cable, shape_batch
 from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import make_target, straight_start
+from cablejax.cores import available_cores
 from cablejax.dataset.drawing import draw_all
 from cablejax.dataset.generate import generate, make_engine, shards_at_once, simulate
 from cablejax.dataset.schema import DatasetConfig
@@ -190,7 +190,7 @@ def control_calls(controller: MPC, history: History) -> Callable[[], None]:
 def cores_as_devices() -> None:
     """Makes every core of a processor a device, over which cables can be spread, unless JAX has computed already."""
     with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+        jax.config.update("jax_num_cpu_devices", available_cores())
 
 
 def batched_control(controller: MPC, history: History, size: int) -> tuple[Callable[[], None], int]:

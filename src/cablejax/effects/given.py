@@ -167,7 +167,8 @@ def parse_effect(text: str) -> GivenEffect:
     for item in filter(None, (part.strip() for part in rest.split(","))):
         key, equals, number = item.partition("=")
         try:
-            value = float(number) if equals else math.nan
+            # Python reads 1_0 as 10
+            value = float(number) if equals and "_" not in number else math.nan
         except ValueError:
             value = math.nan
         if not math.isfinite(value):

@@ -39,7 +39,8 @@ class State:
         reward: minus the error, shape [].
         done: 1 where the target is reached or the simulation has diverged, else 0, shape [].
         metrics: "error", the root mean square distance of the true keypoints to the target [lengths of the cable].
-        info: "physics" and "target" [m] of the episode, and "rng" of the noise. What wrappers add is kept.
+        info: "physics" and "target" [m] of the episode, "rng" of the noise, and "executed_action", shape [6]: the last
+            action after its limits, 0 where it was not executed and after a reset. What wrappers add is kept.
     """
 
     data: CableState
@@ -84,7 +85,8 @@ class MjxShapeCable:
         true = self._engine.keypoints(without_bias(physics), start)
         seen, _ = self._moved(physics, start, jnp.zeros((2, 3)))[1]
         rng, obs, error = self._observed(rng, true, seen, start, target)
-        return State(start, obs, zero, zero, {"error": error}, {"rng": rng, "physics": physics, "target": target})
+        info = {"rng": rng, "physics": physics, "target": target, "executed_action": jnp.zeros(6, jnp.float32)}
+        return State(start, obs, zero, zero, {"error": error}, info)
 
     def step(self, state: State, action: Float[Array, " 6"]) -> State:
         """One action, both grippers' twists as one vector in units of `speed` and `turn_rate`, cut off at 1.
@@ -97,6 +99,7 @@ class MjxShapeCable:
         true, diverged, torn = config.outcome(self._engine, info["physics"], before, after)
         sound = ~diverged & ~torn
         data = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, before)
+        executed = jnp.where(sound, (twist / config.scale).ravel(), 0.0)
         rng, obs, error = self._observed(info["rng"], true, seen, data, info["target"])
         obs, error = jnp.where(sound, obs, state.obs), jnp.where(sound, error, state.metrics["error"])
         done = ((error <= config.tolerance) | diverged).astype(jnp.float32)
@@ -107,7 +110,7 @@ class MjxShapeCable:
             reward=-error,
             done=done,
             metrics={**state.metrics, "error": error},
-            info={**info, "rng": rng},
+            info={**info, "rng": rng, "executed_action": executed.astype(jnp.float32)},
         )
 
     @property

@@ -53,11 +53,20 @@ class Layout:
     path: pathlib.Path
 
     def log_of(self, takes: tuple[Take, ...], repairs: Sequence[str]) -> tuple[GapLog, list[str]]:
-        """The gap log of takes as read, checked and repaired, and a sentence on each repair, after those given."""
+        """The gap log of takes as read, checked and repaired, and a sentence on each repair, after those given.
+
+        Raises:
+            ValueError: the takes cannot be repaired without guessing, or the layout's numbers are not those of a cable
+                that they show.
+        """
         measured = all(take.gripper_pose is not None for take in takes)
         takes, more = prepare(takes, self.setup)
         repairs = [*repairs, *more]
-        return gap_log_from_takes(takes, self.nominal, source=self.source, repairs=repairs, measured=measured), repairs
+        try:
+            log = gap_log_from_takes(takes, self.nominal, source=self.source, repairs=repairs, measured=measured)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error}") from None
+        return log, repairs
 
 
 class Fields:
