@@ -71,7 +71,7 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     text = page(experiment, trials, "python x.py", "where", picture=None)
     assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
     assert "### How runs end" in text and "| online visual servo | U | 2 |" in text
-    assert re.search(r"takes, on average: U [789]\.\d s\.", text)
+    assert re.search(r"the grippers need on average U [789]\.\d s from these starts", text)
 
 
 @pytest.mark.parametrize("cases", [nearby_cases, random_cases, harder_cases])
