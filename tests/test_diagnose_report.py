@@ -23,7 +23,7 @@ from cablejax.diagnose.where import localise
 from cablejax.effects import OUTSIDE
 from cablejax.gaplog import write_gap_log
 from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
-from cablejax.report.diagnosis_figures import where_figure
+from cablejax.report.diagnosis_figures import where_figure, worst_moment
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.diagnosis_sections import ranking_note
 from cablejax.report.effect_words import effect_place, instruction, quantity, share
@@ -400,7 +400,7 @@ def test_in_space_the_page_describes_the_search_the_noise_and_the_units(space):
     result, page, verdict = space
     figure = ranking_figure(result)
     assert figure is not None and len(figure.axes) == 1
-    assert [text.get_text() for text in figure.axes[0].texts] == ["-319", "90", "-50"]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["-319 %", "90 %", "-50 %"]
     names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert names == ["quadratic drag, did not help", "bending stiffness, kept", "lumped mass, not judged"]
     assert page.index("<td>did not help") < page.index("<td>kept") < page.index("<td>not judged")
@@ -417,6 +417,14 @@ def test_in_space_the_page_describes_the_search_the_noise_and_the_units(space):
     assert "It is largest in file" in page and "of 4 only" not in page
     assert verdict["where"]["along_cable_mm"][4] == pytest.approx(30, rel=0.1)
     assert [row["horizon_s"] for row in verdict["where"]["per_horizon_mm"]] == [1.0, 2.0]
+
+
+def test_the_worst_moment_is_a_sample_of_a_log_shorter_than_the_smoothing():
+    result = diagnosis()
+    samples = result.log.time.shape[1]
+    short = dataclasses.replace(result.log, time=result.log.time * 0.2 / result.log.time.max())
+    episode, sample = worst_moment(dataclasses.replace(result, log=short))
+    assert 0 <= episode < len(result.log.time) and 0 <= sample < samples
 
 
 def test_failed_write_leaves_the_verdict_that_was_there(tmp_path):

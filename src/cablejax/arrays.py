@@ -1,4 +1,4 @@
-"""Array helpers for all stages: flags, unobserved points, wrapped angles, lengths, quarter turns, quaternions."""
+"""Array helpers for all stages: flags, choices, unobserved points, angles, lengths, quarter turns, quaternions."""
 
 from __future__ import annotations
 
@@ -18,6 +18,11 @@ def filled(points: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
     """Points with NaN interpolated between their neighbours in the order of the points; at least one must be finite."""
     seen, index = np.isfinite(points).all(axis=1), np.arange(len(points))
     return np.stack([np.interp(index, index[seen], column[seen]) for column in points.T], axis=1)
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """Indices of up to `most` of `count` things, evenly spread, the first and the last among them."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()
 
 
 def mean_of_finite(values: np.ndarray, axis: tuple[int, ...] | int | None) -> np.ndarray:

@@ -70,7 +70,7 @@ def write_gif(path: str | os.PathLike[str], runs: Runs, *, width: int = 960, fra
             _still(ax, shape, panel, views[shape])
         drawn = axes[-1].lines[:1]
         figure.legend(drawn, ["target"], loc="center left", bbox_to_anchor=(300 / width, top), labelcolor=LIGHT.muted)
-        draw_scale_bar(axes[-1], views[list(pairs)[-1]], length)
+        draw_scale_bar(axes[-1], 0.2 * length)
 
         def draw(time: float) -> list[Any]:
             clock.set_text(f"{time:.0f} s")

@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis
-from cablejax.diagnose.judgement import effect_title
+from cablejax.diagnose.judgement import effect_title, share
 from cablejax.report.effect_words import explained_label, millimetres, short
-from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, draw_bars
 
 _MAX_RANKED = 8
 # Longest label of an effect [characters].
@@ -43,29 +43,19 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
     named = {effect.name for effect in diagnosis.effects}
     alike = {name for group in diagnosis.equivalent for name in group} - named
     colours = [LIGHT.residual if r.name in named else _LIGHT_BLUE if r.name in alike else LIGHT.target for r in ranked]
-    # few bars are not blown up
-    rows = max(len(ranked), 3)
-    y = rows - 1 - np.arange(len(ranked))
+    # of a file that anything may have written
+    labels = [f"{effect_title(r.name)}{f', {r.outcome}' if r.outcome else ''}"[:_LABEL] for r in ranked]
     # were there no other causes than those of the library
-    chance = "probability [%]" if diagnosis.effects else "probability, if the cause is in the library [%]"
+    chance = "probability" if diagnosis.effects else "probability, if the cause is in the library"
+    panels = [([r.held_out_shrinkage for r in ranked], "share of the gap that it removes")]
+    if likely:
+        panels.insert(0, ([r.probability or 0.0 for r in ranked], chance))
     with matplotlib.rc_context(DIAGNOSIS_STYLE):
-        figure = Figure(figsize=(10.0, 0.9 + 0.36 * rows), layout="constrained")
-        panels = [([100 * r.held_out_shrinkage for r in ranked], "share of the gap that it removes [%]")]
-        if likely:
-            panels.insert(0, ([100 * (r.probability or 0.0) for r in ranked], chance))
+        figure = Figure(figsize=(10.0, 0.9 + 0.36 * max(len(ranked), 3)), layout="constrained")
         axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for ax, (values, title) in zip(axes, panels, strict=True):
-            ax.barh(y, np.maximum(values, 0.0), color=colours, height=0.62)
-            for row, value in zip(y, values, strict=True):
-                ax.text(max(value, 0.0) + 1.5, row, _percent(value), va="center", fontsize=10)
-            ax.set(xlim=(0, 112), ylim=(-0.6, rows - 0.4), xticks=[])
-            ax.spines[["bottom"]].set_visible(False)
+            draw_bars(ax, labels, values, list(map(share, values)), colours, 1.0)
             ax.set_title(title)
-            ax.tick_params(length=0)
-        labels = [f"{effect_title(r.name)}{f', {r.outcome}' if r.outcome else ''}" for r in ranked]
-        # of a file that anything may have written
-        axes[0].set_yticks(y, [label[:_LABEL] for label in labels])
-        axes[0].tick_params(labelcolor=LIGHT.ink)
     return figure
 
 
@@ -129,23 +119,13 @@ def _split_bar(ax: Axes, split: dict[str, float | None], *, named: bool) -> None
     """Parts of the squared error before; without effects that are named, what the best explanation would take away."""
     begin = 0.0
     for key, label, colour in _SPLIT:
-        share = split.get(key) or 0.0
+        part = split.get(key) or 0.0
         label = "best found, not named" if key == "named" and not named else label
-        if share >= 5e-3:
-            ax.barh(0, share, left=begin, color=colour, height=0.6, label=f"{label} {100 * share:.0f} %")
-            begin += share
+        if part >= 5e-3:
+            ax.barh(0, part, left=begin, color=colour, height=0.6, label=f"{label} {100 * part:.0f} %")
+            begin += part
     ax.set(xlim=(0, 1), ylim=(-0.4, 0.4), yticks=[], xticks=[])
     ax.spines[:].set_visible(False)
     ax.set_title("The squared error before consists of")
     if begin:
         ax.legend(loc="upper left", bbox_to_anchor=(0.0, 0.05), ncols=4, fontsize=9.5, handlelength=1.0, borderpad=0.0)
-
-
-def _percent(value: float) -> str:
-    if not np.isfinite(value):
-        return "n/a"
-    if value >= 99.5:
-        return "> 99"
-    if value <= -0.5:
-        return f"{value:.0f}"
-    return f"{value:.0f}" if value >= 0.5 or value == 0 else "< 1"

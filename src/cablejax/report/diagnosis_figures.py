@@ -5,6 +5,8 @@ Each takes a `CableDiagnosis` and gives a `matplotlib.figure.Figure` that belong
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,7 +19,7 @@ from cablejax.arrays import stretches
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
 from cablejax.diagnose.judgement import effect_title
 from cablejax.report.effect_words import explained_label, millimetres, short
-from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, bar_of, cable_curve, draw_grippers
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, draw_grippers, draw_scale_bar
 
 # Transparent where there is no gap, so that it reads on a light and on a dark page.
 _HEAT = LinearSegmentedColormap.from_list(
@@ -35,10 +37,8 @@ def worst_moment(diagnosis: CableDiagnosis) -> tuple[int, int]:
     """Episode and sample at which the observed cable is furthest from the nominal one, over half a second."""
     seen = np.isfinite(diagnosis.where.heat)
     squared = np.where(seen, diagnosis.where.heat**2, 0.0).sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)
-    widths = [max(1, round(0.5 / _interval(diagnosis, episode))) for episode in range(len(squared))]
-    smooth = np.stack(
-        [np.convolve(row, np.ones(width) / width, mode="same") for row, width in zip(squared, widths, strict=True)]
-    )
+    kernels = [_mean_over(diagnosis, episode, 0.5) for episode in range(len(squared))]
+    smooth = np.stack([np.convolve(row, kernel, "same") for row, kernel in zip(squared, kernels, strict=True)])
     # one that shows the whole cable, if there is any
     whole = seen.sum(axis=-1) >= seen.sum(axis=-1).max()
     episode, sample = np.unravel_index(np.argmax(np.where(whole, smooth, -1.0)), smooth.shape)
@@ -87,11 +87,11 @@ def cable_figure(diagnosis: CableDiagnosis) -> Figure:
             believed, dashes = "nominal simulator", (0, (4, 2))
             axes.plot(*cable_curve(nominal).T, color=LIGHT.direct, lw=2.0 * thick, ls=dashes, label=believed)
             axes.plot(*observed.T, "o", color=LIGHT.ink, ms=4.5 * thick, label="observed keypoints")
-        _bar(ax, 0.1 * length)
+        draw_scale_bar(ax, 0.1 * length)
         if zoom is not None:
             zoom.set_title("enlarged", fontsize=10)
             ax.add_patch(Rectangle(tuple(middle - reach), 2 * reach, 2 * reach, fill=False, ec=LIGHT.muted, lw=1))
-            _bar(zoom, 0.5 * reach)
+            draw_scale_bar(zoom, 0.5 * reach)
         handles, labels = ax.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower left", ncols=len(labels))
     return figure
@@ -139,18 +139,20 @@ def _edges(places: np.ndarray) -> np.ndarray:
     return np.concatenate([[places[0] - first], between, [places[-1] + last]])
 
 
-def _interval(diagnosis: CableDiagnosis, episode: int) -> float:
-    steps = np.diff(diagnosis.log.time[episode, : diagnosis.log.episode_length[episode]])
-    return float(np.median(steps)) if len(steps) else 1.0
+def _mean_over(diagnosis: CableDiagnosis, episode: int, seconds: float) -> np.ndarray:
+    """Equal weights of the samples in so many seconds of an episode, at most all of it, for a moving mean."""
+    samples = int(diagnosis.log.episode_length[episode])
+    steps = np.diff(diagnosis.log.time[episode, :samples])
+    width = max(1, round(seconds / float(np.median(steps)))) if len(steps) else 1
+    return np.full(min(width, samples), 1.0 / min(width, samples))
 
 
 def _smoothed(diagnosis: CableDiagnosis, episode: int) -> np.ndarray:
     """Gap in noise units over about one second, noise taken out, shape [T, N]; NaN where nothing was observed."""
     length = int(diagnosis.log.episode_length[episode])
     squared = diagnosis.where.heat[episode, :length] ** 2
-    width = max(1, round(_SMOOTHING_S / _interval(diagnosis, episode)))
     seen = np.isfinite(squared)
-    kernel = np.ones((min(width, length), 1))
+    kernel = _mean_over(diagnosis, episode, _SMOOTHING_S)[:, None]
     sums, counts = (convolve(part, kernel, "same", "direct") for part in (np.where(seen, squared, 0.0), seen))
     with np.errstate(invalid="ignore"):
         return np.sqrt(np.maximum(sums / np.where(counts > 0, counts, np.nan) - 1.0, 0.0))
@@ -171,7 +173,6 @@ def _strip(ax: Axes, diagnosis: CableDiagnosis, arclength: np.ndarray) -> None:
         ax.text(s, 1.12, short(value), ha="center", va="bottom", fontsize=9, color=LIGHT.muted)
     for effect in diagnosis.effects:
         for low, high in _sections(effect, arclength):
-            low, high = _wide_enough(low, high, arclength)
             ax.plot([low, high], [-0.22, -0.22], color=LIGHT.residual, lw=5, solid_capstyle="butt", clip_on=False)
             ax.text(
                 0.5 * (low + high),
@@ -196,9 +197,8 @@ def _mark_holds(ax: Axes, diagnosis: CableDiagnosis, episode: int, top: float) -
     rests = [masks[name] for name in ("start: at rest", "speed: hold") if name in masks]
     if not rests:
         return
-    hold = np.any(rests, axis=0)
     time = diagnosis.log.time[episode]
-    for begin, end in stretches(hold[episode, :length]):
+    for begin, end in stretches(np.any(rests, axis=0)[episode, :length]):
         ax.plot([time[begin], time[end - 1]], [top, top], color=LIGHT.ink, lw=3, solid_capstyle="butt", clip_on=False)
 
 
@@ -210,7 +210,6 @@ def _draw_places(ax: Axes, diagnosis: CableDiagnosis, cable: np.ndarray) -> None
     for effect in diagnosis.effects:
         table = effect.location.get("table_m")
         for low, high in _sections(effect, arclength):
-            low, high = _wide_enough(low, high, arclength)
             part = curve[(s >= low) & (s <= high)]
             ax.plot(*part.T, color=LIGHT.residual, alpha=0.22, lw=17, solid_capstyle="butt")
         if table is not None:
@@ -219,25 +218,15 @@ def _draw_places(ax: Axes, diagnosis: CableDiagnosis, cable: np.ndarray) -> None
             ax.add_patch(Circle(tuple(table), size, fc=LIGHT.residual, ec=LIGHT.residual, alpha=0.3, lw=1.5))
 
 
-def _wide_enough(low: float, high: float, arclength: np.ndarray) -> tuple[float, float]:
-    """A section about the same place, wide enough to be seen on this cable."""
-    half = max(0.5 * (high - low), _MARK * (arclength[-1] - arclength[0]))
-    return 0.5 * (low + high) - half, 0.5 * (low + high) + half
+def _sections(effect: NamedEffect, arclength: np.ndarray) -> Iterator[tuple[float, float]]:
+    """Begin and end [m] of each place of an effect along the cable, wide enough to be seen on it.
 
-
-def _sections(effect: NamedEffect, arclength: np.ndarray) -> list[tuple[float, float]]:
-    """Places of an effect along the cable; one that names several keypoints has one at each."""
-    index = effect.parameters.get("index")
+    An effect that names several keypoints has a place at each.
+    """
+    index, along = effect.parameters.get("index"), effect.location.get("along_cable_m")
+    places = [] if along is None else [along]
     if index is not None:
-        return [(float(arclength[i]), float(arclength[i])) for i in np.atleast_1d(index.value)]
-    along = effect.location.get("along_cable_m")
-    return [] if along is None else [(float(along[0]), float(along[1]))]
-
-
-def _bar(ax: Axes, about: float) -> None:
-    """A scale bar of about this length [m]."""
-    bar, label = bar_of(about)
-    (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
-    x, y = x1 - 0.04 * (x1 - x0), y0 + 0.05 * (y1 - y0)
-    ax.plot([x - bar, x], [y, y], color=LIGHT.muted, lw=1.8, solid_capstyle="butt")
-    ax.text(x, y + 0.02 * (y1 - y0), label, ha="right", va="bottom", color=LIGHT.muted, fontsize=9)
+        places = [(arclength[i], arclength[i]) for i in np.atleast_1d(index.value)]
+    for low, high in places:
+        half = max(0.5 * (high - low), _MARK * (arclength[-1] - arclength[0]))
+        yield float(0.5 * (low + high) - half), float(0.5 * (low + high) + half)

@@ -30,7 +30,7 @@ from cablejax.report.effect_words import (
 )
 from cablejax.report.html import json_script, svg, write_html
 from cablejax.report.motion_figures import motion_figure, write_motion_gif
-from cablejax.report.spatial_figures import cable_still, files_figure, orbit_data
+from cablejax.report.spatial_figures import cable_still, files_figure, orbit_data, with_the_cause
 from cablejax.whole_file import whole_file
 
 PAGE = "report.html"
@@ -87,13 +87,13 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
     simulated = {name: getattr(diagnosis, name) for name in SIMULATED}
     given = {name: points for name, points in simulated.items() if points is not None}
     write_gap_log(out / SIMULATIONS, diagnosis.log, overwrite=True, simulated=given)
-    space = diagnosis.log.in_space
+    space, following = diagnosis.log.in_space, diagnosis.next_motion
     drawn = {
         "cable": cable_still(diagnosis) if space else cable_figure(diagnosis),
         "where": files_figure(diagnosis) if space else where_figure(diagnosis),
         "ranking": ranking_figure(diagnosis),
         "shrinkage": shrinkage_figure(diagnosis),
-        "motion": motion_figure(diagnosis.next_motion),
+        "motion": motion_figure(following),
     }
     inline = {}
     for name, figure in drawn.items():
@@ -108,14 +108,13 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
             # none of an earlier diagnosis next to this page
             picture.unlink(missing_ok=True)
     preview = out / "next_motion.gif"
-    if diagnosis.next_motion is None:
+    if following is None:
         preview.unlink(missing_ok=True)
     else:
-        write_motion_gif(preview, diagnosis.next_motion)
-    kind, badge = _BADGES[diagnosis.verdict]
-    following, orbit = diagnosis.next_motion, None
+        write_motion_gif(preview, following)
+    (kind, badge), orbit = _BADGES[diagnosis.verdict], None
     if space:
-        label = explained_label(diagnosis) if diagnosis.explained is not None and diagnosis.effects else ""
+        label = "" if with_the_cause(diagnosis) is None else explained_label(diagnosis)
         orbit = {"data": json_script(orbit_data(diagnosis)), "explained": label}
     path = out / PAGE
     named, addable = {effect.name for effect in diagnosis.effects}, sections.addable(diagnosis) and not space
@@ -157,9 +156,8 @@ def _lead(diagnosis: CableDiagnosis) -> str:
     """The log and its gap in one line."""
     log, gap = diagnosis.log, diagnosis.gap
     seconds = sum(float(t[n - 1] - t[0]) for t, n in zip(log.time, log.episode_length, strict=True))
-    episodes = len(log.episode_length)
     return (
-        f"{counted(episodes, 'episode')}, {seconds:.0f} s, {log.keypoints.shape[2]} keypoints. "
+        f"{counted(len(log.episode_length), 'episode')}, {seconds:.0f} s, {log.keypoints.shape[2]} keypoints. "
         f"The simulator misses the recorded cable by {millimetres(gap.before_rmse_mm)}; the recording's own "
         f"{_noise(diagnosis)}."
     )
@@ -176,8 +174,7 @@ def _works(diagnosis: CableDiagnosis) -> str:
         said = "This log cannot show it, since no motion was held out of the fit: record a second motion."
     else:
         said = "Not on this log: no effect of the library explains enough of the gap, so none is named."
-    noun = "limit" if limits == 1 else "limits"
-    return f"{said} This verdict has {limits} {noun}: see the end of the page." if limits else said
+    return f"{said} This verdict has {counted(limits, 'limit')}: see the end of the page." if limits else said
 
 
 def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
@@ -186,9 +183,8 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
     if diagnosis.effects:
         alike = (in_its_place(e.name, diagnosis.equivalent, diagnosis.effects) for e in diagnosis.effects)
         names = listed(list(dict.fromkeys(listed([*map(effect_title, names)], "or") for names in alike)))
-        note = _chance(diagnosis)
         title = "Part of the cause" if diagnosis.verdict == "named+unknown" else "Cause"
-        yield (title, names, note)
+        yield (title, names, _chance(diagnosis))
         places = [p for p in (effect_place(e) for e in diagnosis.effects) if p]
         yield ("Place of the cause", listed(places) if places else "not in one place", _peak(diagnosis))
     elif diagnosis.verdict == "none":

@@ -151,8 +151,7 @@ def how_far(diagnosis: CableDiagnosis) -> str:
         )
     else:
         held = [str(e) for e in gap.held_out_episodes]
-        word = "episode" if len(held) == 1 else "episodes"
-        named = f"{word} {listed(held)}" if len(held) <= _LISTED else f"{len(held)} {word}"
+        named = f"episode{'s' * (len(held) > 1)} {listed(held)}" if len(held) <= _LISTED else f"{len(held)} episodes"
         interval = ""
         if gap.shrinkage_ci90 is not None:
             interval = f" (90 % interval over episodes: {between(*gap.shrinkage_ci90)})"

@@ -147,13 +147,16 @@ def short(value: float) -> str:
     return f"{value:.1f}" if abs(value) >= 0.095 or value == 0 else f"{value:.2f}"
 
 
-def _place(location: dict[str, Any], gripper: Any = None) -> str:
-    """Place of an effect: "between 0.19 and 0.42 m from gripper 0"; "" where it has no place."""
+def effect_place(effect: NamedEffect) -> str:
+    """Where an effect acts, in words: keypoints, a gripper, a section, a time; "" where it acts everywhere."""
+    index, gripper = (effect.parameters.get(name) for name in ("index", "gripper"))
+    along, time, table = (effect.location.get(key) for key in ("along_cable_m", "time_s", "table_m"))
+    if index is not None and isinstance(index.value, list):
+        return f"at keypoints {listed([str(i) for i in sorted(index.value)])}"
     parts = []
-    along, time, table = (location.get(key) for key in ("along_cable_m", "time_s", "table_m"))
     if gripper is not None:
-        several = isinstance(gripper, list)
-        parts.append(f"at grippers {listed([str(g) for g in gripper])}" if several else f"at gripper {gripper}")
+        grippers = gripper.value if isinstance(gripper.value, list) else [gripper.value]
+        parts.append(f"at gripper{'s' * (len(grippers) > 1)} {listed(list(map(str, grippers)))}")
     elif along is not None:
         low, high = along
         parts.append(
@@ -164,15 +167,6 @@ def _place(location: dict[str, Any], gripper: Any = None) -> str:
     if time is not None:
         parts.append(f"{time:.1f} s into the episode")
     return ", ".join(parts)
-
-
-def effect_place(effect: NamedEffect) -> str:
-    """Place of an effect in words: keypoints, a gripper, or a stretch of cable."""
-    index = effect.parameters.get("index")
-    if index is not None and isinstance(index.value, list):
-        return f"at keypoints {listed([str(i) for i in sorted(index.value)])}"
-    gripper = effect.parameters.get("gripper")
-    return _place(effect.location, None if gripper is None else gripper.value)
 
 
 def between(low: float, high: float) -> str:

@@ -68,7 +68,7 @@ def final_shapes(runs: Runs) -> Figure:
                     words, (0.0, 0.0), xycoords="axes fraction", xytext=(0.0, -4.0 - 15.0 * row),
                     textcoords="offset points", color=LIGHT.method(method), va="top", fontsize=10.5,
                 )  # fmt: skip
-        draw_scale_bar(axes[-1], views[next(reversed(views))], size_of(runs))
+        draw_scale_bar(axes[-1], 0.2 * size_of(runs))
         _method_legend(figure, runs, Line2D([], [], color=LIGHT.target, lw=7, alpha=0.45, label="target"))
     return figure
 
@@ -164,7 +164,7 @@ def snapshots(runs: Runs) -> Figure:
             ax.plot(*cable_curve(run.target.keypoints).T, color=LIGHT.target, lw=1.6, ls=(0, (4, 3)))
             _draw_cable(ax, run, int(index), "residual", length)
             ax.set_title(f"{run.times[index]:.0f} s   {run.error_cm[index]:.2f} cm", fontsize=10)
-        draw_scale_bar(axes[-1], view, length)
+        draw_scale_bar(axes[-1], 0.2 * length)
     return figure
 
 

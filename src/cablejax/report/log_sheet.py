@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from cablejax.arrays import evenly
 from cablejax.cable_file import config_of_log
 from cablejax.control.run import shape_error_cm
 from cablejax.diagnose.noise import noise_floor
@@ -37,7 +38,7 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
     noise, how = _noise(log)
     file = shlex.quote(name)
     # a few episodes, evenly over the log
-    chosen = np.unique(np.linspace(0, len(episodes) - 1, min(len(episodes), _SHOWN)).round().astype(int)).tolist()
+    chosen = evenly(len(episodes), _SHOWN)
     drawn = [(dataclasses.replace(episodes[e], motion=f"{e}: {episodes[e].motion}"), targets[e]) for e in chosen]
     stated = any(target is not None for target in targets)
     which = "" if len(chosen) == len(episodes) else f" {len(chosen)} of {len(episodes)} episodes."
@@ -138,7 +139,7 @@ def _shapes_figure(episodes: Sequence[tuple[Episode, np.ndarray | None]]) -> Fig
             points = episode.keypoints.astype(float)
             view = _view(points)
             seen = np.flatnonzero(np.isfinite(points).all(axis=-1).sum(axis=1) >= 2)
-            moments = seen[np.unique(np.linspace(0, max(len(seen) - 1, 0), _MOMENTS).round().astype(int))[: len(seen)]]
+            moments = seen[evenly(len(seen), _MOMENTS)]
             if target is not None:
                 ax.plot(*cable_curve(target[:, view]).T, color=LIGHT.target, lw=7, alpha=0.45, solid_capstyle="round")
             for k, t in enumerate(moments[:-1]):

@@ -7,15 +7,23 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from cablejax.arrays import evenly
 from cablejax.control.targets import length_through
 from cablejax.diagnose.diagnosis import NextMotion
 from cablejax.diagnose.judgement import effect_title
 from cablejax.report.animation import DPI, animate
 from cablejax.report.effect_words import explanation_title
-from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, draw_grippers, draw_scale_bar, drawn_size
+from cablejax.report.style import (
+    DIAGNOSIS_STYLE,
+    LIGHT,
+    cable_curve,
+    draw_bars,
+    draw_grippers,
+    draw_scale_bar,
+    drawn_size,
+)
 
 _COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")
 _MOMENTS = 5
@@ -42,16 +50,16 @@ def motion_figure(following: NextMotion | None) -> Figure | None:
 
 def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> None:
     """Writes a preview of the motion, five times as fast."""
-    (low, high), length = _window(following), _size(following)
+    (x0, x1, y0, y1), length = _window(following), _size(following)
     names, width = list(following.shapes), _WIDTH / DPI
     header = (_HEADER + _LINE * len(names)) / DPI
-    height = header + max(width * (high[1] - low[1]) / (high[0] - low[0]), 0.01)
+    height = header + max(width * (y1 - y0) / (x1 - x0), 0.01)
     last, step = len(following.poses) - 1, _SPEED / _FRAMES_PER_SECOND / following.interval
     with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(width, height), dpi=DPI)
-        ax = figure.add_axes((0.0, 0.0, 1.0, 1.0 - header / height), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        ax = figure.add_axes((0.0, 0.0, 1.0, 1.0 - header / height), xlim=(x0, x1), ylim=(y0, y1))
         ax.set_axis_off()
-        draw_scale_bar(ax, (low[0], high[0], low[1], high[1]), length)
+        draw_scale_bar(ax, 0.2 * length)
         figure.text(0.02, 1.0 - 0.1 / height, "Record next", size=12, weight="bold", va="top")
         clock = figure.text(0.98, 1.0 - 0.1 / height, "", size=12, weight="bold", ha="right", va="top")
         for row, (name, colour) in enumerate(zip(names, _COLOURS, strict=False)):
@@ -70,17 +78,17 @@ def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> Non
 
 
 def _film(figure: Any, following: NextMotion) -> None:
-    moments, (low, high), length = telling_moments(following), _window(following), _size(following)
+    moments, (x0, x1, y0, y1), length = telling_moments(following), _window(following), _size(following)
     for ax, sample in zip(figure.subplots(1, len(moments), squeeze=False)[0], moments, strict=True):
         for gripper in range(2):
             ax.plot(*following.poses[:, gripper, :2].T, color=LIGHT.faint, lw=1.5)
         draw_grippers(ax, following.poses[sample], length, alpha=0.85)
         for (name, points), colour in zip(following.shapes.items(), _COLOURS, strict=False):
             ax.plot(*cable_curve(points[sample]).T, color=colour, lw=1.8, label=explanation_title(name))
-        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
+        ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xticks=[], yticks=[])
         ax.spines[:].set_visible(False)
         ax.set_title(f"{following.interval * sample:.0f} s", fontsize=10)
-    draw_scale_bar(figure.axes[-1], (low[0], high[0], low[1], high[1]), length)
+    draw_scale_bar(figure.axes[-1], 0.2 * length)
     if len(following.shapes) > 1:
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=5, fontsize=10)
 
@@ -90,7 +98,7 @@ def telling_moments(following: NextMotion) -> list[int]:
     points = np.stack(list(following.shapes.values()))
     samples = points.shape[1]
     if len(points) < 2:
-        return np.linspace(0, samples - 1, _MOMENTS).round().astype(int).tolist()
+        return evenly(samples, _MOMENTS)
     differences = np.linalg.norm(points[:, None] - points[None], axis=-1).max(axis=(0, 1, 3))
     chosen: list[int] = []
     for sample in np.argsort(-differences, kind="stable"):
@@ -101,17 +109,11 @@ def telling_moments(following: NextMotion) -> list[int]:
 
 def _worth(ax: Any, following: NextMotion) -> None:
     """Bars of the information of every motion, and the doubt that there is."""
-    names = sorted(following.alternatives, key=lambda name: following.alternatives[name])
+    names = sorted(following.alternatives, key=lambda name: -following.alternatives[name])
     values = [following.alternatives[name] for name in names]
     colours = [LIGHT.residual if name == following.motion else LIGHT.target for name in names]
-    widest = max(*values, following.doubt, 1e-9)
-    ax.barh(range(len(names)), values, color=colours, height=0.62)
-    for row, value in enumerate(values):
-        ax.text(value + 0.01 * widest, row, f"{value:.2g}", va="center", fontsize=10)
-    ax.set_yticks(range(len(names)), [effect_title(name) for name in names])
-    ax.set(xticks=[], xlim=(0, 1.1 * widest))
-    ax.spines[["bottom"]].set_visible(False)
-    ax.tick_params(length=0, labelcolor=LIGHT.ink)
+    longest = max(*values, following.doubt, 1e-9)
+    draw_bars(ax, list(map(effect_title, names)), values, [f"{value:.2g}" for value in values], colours, longest)
     if following.separates:
         ax.axvline(following.doubt, color=LIGHT.ink, lw=1.2, ls=(0, (5, 3)))
         ax.set_title(f"Information about which explanation holds [nats]; dashed: the doubt, {following.doubt:.2g}")
@@ -119,13 +121,12 @@ def _worth(ax: Any, following: NextMotion) -> None:
         ax.set_title("Information about the parameters [nats]")
 
 
-def _window(following: NextMotion) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Lowest and highest corner of what is drawn [m]."""
-    every = np.concatenate(
-        [following.poses[..., :2].reshape(-1, 2), *(p.reshape(-1, 2) for p in following.shapes.values())]
-    )
-    margin = _MARGIN * _size(following)
-    return np.nanmin(every, axis=0) - margin, np.nanmax(every, axis=0) + margin
+def _window(following: NextMotion) -> tuple[float, float, float, float]:
+    """The view (x0, x1, y0, y1) [m] of all that is drawn."""
+    drawn = (following.poses[..., :2], *following.shapes.values())
+    every, margin = np.concatenate([points.reshape(-1, 2) for points in drawn]), _MARGIN * _size(following)
+    (x0, y0), (x1, y1) = np.nanmin(every, axis=0) - margin, np.nanmax(every, axis=0) + margin
+    return float(x0), float(x1), float(y0), float(y1)
 
 
 def _size(following: NextMotion) -> float:

@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from cablejax.arrays import mean_of_finite
+from cablejax.arrays import evenly, mean_of_finite
 from cablejax.diagnose.diagnosis import CableDiagnosis
 from cablejax.gaplog import labels
 from cablejax.report.effect_words import explained_label
@@ -18,6 +18,11 @@ from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 _FRAME = 0.04  # [s] between two pictures of the player
 _SHOWN = 4
 _LOST = 0.5  # [m]
+
+
+def with_the_cause(diagnosis: CableDiagnosis) -> np.ndarray | None:
+    """Keypoints simulated with the named effects [m], shape [E, T, N, 3]; None where none is named."""
+    return diagnosis.explained if diagnosis.effects else None
 
 
 def recording_ends(diagnosis: CableDiagnosis, episodes: np.ndarray) -> np.ndarray:
@@ -32,8 +37,8 @@ def recording_ends(diagnosis: CableDiagnosis, episodes: np.ndarray) -> np.ndarra
 def files_figure(diagnosis: CableDiagnosis) -> Figure:
     """The error of every keypoint in every file, before and after."""
     parts = [("nominal simulator", diagnosis.nominal)]
-    if diagnosis.explained is not None and diagnosis.effects:
-        parts.append((explained_label(diagnosis), diagnosis.explained))
+    if (explained := with_the_cause(diagnosis)) is not None:
+        parts.append((explained_label(diagnosis), explained))
     with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(11.0, 2.4 * len(parts) + 0.8), layout="constrained")
         panels = np.atleast_1d(figure.subplots(len(parts), 1, sharex=True))
@@ -62,8 +67,8 @@ def cable_still(diagnosis: CableDiagnosis) -> Figure:
     """The moment of the largest gap, from the front and from the side."""
     e, t = _worst(diagnosis)
     points = {"observed": np.asarray(diagnosis.log.keypoints[e, t], float), "nominal": diagnosis.nominal[e, t]}
-    if diagnosis.explained is not None and diagnosis.effects:
-        points["explained"] = diagnosis.explained[e, t]
+    if (explained := with_the_cause(diagnosis)) is not None:
+        points["explained"] = explained[e, t]
     look = {
         "nominal": {"color": LIGHT.direct, "ls": "--", "label": "nominal simulator"},
         "explained": {"color": LIGHT.residual, "lw": 2.5, "label": explained_label(diagnosis)},
@@ -85,11 +90,11 @@ def cable_still(diagnosis: CableDiagnosis) -> Figure:
 
 def orbit_data(diagnosis: CableDiagnosis) -> dict[str, Any]:
     """Data of the player: the files with the largest, the smallest and middling gaps, in whole millimetres."""
-    log, names = diagnosis.log, labels(diagnosis.log, "file", "take")
+    log, names, explained = diagnosis.log, labels(diagnosis.log, "file", "take"), with_the_cause(diagnosis)
     size = np.asarray(diagnosis.where.per_episode_mm, float)
     used = np.flatnonzero(np.isfinite(size))
     order = used[np.argsort(-size[used])]
-    chosen = list(dict.fromkeys(order[np.linspace(0, len(order) - 1, _SHOWN).round().astype(int)].tolist()))
+    chosen = order[evenly(len(order), _SHOWN)].tolist()
     interval = float(np.median(log.intervals))
     every = max(1, round(_FRAME / interval))
 
@@ -117,8 +122,8 @@ def orbit_data(diagnosis: CableDiagnosis) -> dict[str, Any]:
         off = np.linalg.norm(diagnosis.nominal[e, samples] - observed, axis=-1)
         off = np.nan_to_num(off).max(axis=1)
         entry["shown"] = int(np.where(off < _LOST, off, 0.0).argmax())
-        if diagnosis.explained is not None and diagnosis.effects:
-            entry["explained"] = whole(diagnosis.explained[e, samples])
+        if explained is not None:
+            entry["explained"] = whole(explained[e, samples])
         windows.append(entry)
     return {"interval": every * interval, "windows": windows}
 

@@ -13,9 +13,10 @@ from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.judgement import effect_title, listed, share
 from cablejax.diagnose.study import ENDED, Ended, alternatives
 from cablejax.effects.given import GivenEffect
+from cablejax.limits import counted
 from cablejax.report.effect_words import error_falls, millimetres
 from cablejax.report.sheet import Sheet
-from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, draw_bars
 
 _SHOWN = 5
 _VERDICTS = {
@@ -45,11 +46,11 @@ def study_sheet(
     pictures = [(_beliefs(found), "Probability of each cause after each round, given all recordings so far.")]
     return Sheet(
         kind="study",
-        title=f"After {rounds} recording{'s' if rounds > 1 else ''}: {names}",
+        title=f"After {counted(rounds, 'recording')}: {names}",
         lead=f"{ENDED[why]} {last.sentence}",
         cards=[
             ("Verdict", _VERDICTS[last.verdict] if why != "clear" or none else "named", "" if none else names),
-            ("Recorded", f"{sum(map(len, motions))} motions", f"in {rounds} round{'s' if rounds > 1 else ''}"),
+            ("Recorded", f"{sum(map(len, motions))} motions", f"in {counted(rounds, 'round')}"),
             ("Error", _error(last), "without and with what is named" if last.effects else "nothing is named"),
             (
                 "Staged in the plant",
@@ -125,11 +126,7 @@ def _beliefs(found: Sequence[Diagnosis]) -> Figure:
         axes = np.atleast_1d(figure.subplots(len(found), 1, sharex=True))
         for number, (ax, chance) in enumerate(zip(axes, chances, strict=True), 1):
             values = [chance.get(name, 0.0) for name in names]
-            ax.barh(range(len(names)), [100.0 * value for value in values], color=LIGHT.residual, height=0.65)
-            for y, value in enumerate(values):
-                ax.text(100.0 * value + 1.0, y, share(value), va="center", color=LIGHT.muted)
-            ax.set_yticks(range(len(names)), [effect_title(name) for name in names])
-            ax.invert_yaxis()
-            ax.set(xlim=(0.0, 112.0), title=f"after round {number}")
-        axes[-1].set_xlabel("probability, if the cause is one of those tried [%]")
+            draw_bars(ax, list(map(effect_title, names)), values, list(map(share, values)), LIGHT.residual, 1.0)
+            ax.set_title(f"after round {number}")
+        axes[-1].set_xlabel("probability, if the cause is one of those tried")
     return figure

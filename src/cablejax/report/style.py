@@ -6,6 +6,7 @@ The colours are those of Okabe and Ito, which stay apart for colour-blind reader
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -205,9 +206,33 @@ def bar_of(length: float) -> tuple[float, str]:
     return bar, f"{factor * bar:g} {unit}"
 
 
-def draw_scale_bar(ax: Any, view: tuple[float, float, float, float], length: float) -> None:
-    """A bar of about a fifth of the cable's length in the lower right corner of a view [m]."""
-    bar, label = bar_of(0.2 * length)
-    x, y = view[1] - 0.02 * length, view[2] + 0.02 * length
+def draw_scale_bar(ax: Any, about: float) -> None:
+    """A bar of about this length [m] in the lower right corner of axes whose limits are set."""
+    bar, label = bar_of(about)
+    x, y = ax.get_xlim()[1] - 0.1 * about, ax.get_ylim()[0] + 0.1 * about
     ax.plot([x - bar, x], [y, y], color=LIGHT.muted, lw=1.5, solid_capstyle="butt")
-    ax.text(x - bar / 2, y + 0.012 * length, label, ha="center", va="bottom", color=LIGHT.muted, fontsize=9)
+    ax.text(x - bar / 2, y + 0.06 * about, label, ha="center", va="bottom", color=LIGHT.muted, fontsize=9)
+
+
+def draw_bars(
+    ax: Any, names: Sequence[str], values: Sequence[float], words: Sequence[str], colours: Any, longest: float
+) -> None:
+    """Horizontal bars with a name on the left and words at the end of each, the first one on top.
+
+    Args:
+        ax: empty axes.
+        names: of the bars.
+        values: their lengths; a negative one has no bar.
+        words: at their ends.
+        colours: one, or one for each.
+        longest: the value at which a bar reaches almost across the axes.
+    """
+    lengths = np.maximum(values, 0.0)
+    ax.barh(range(len(names)), lengths, color=colours, height=0.62)
+    for row, (length, word) in enumerate(zip(lengths, words, strict=True)):
+        ax.text(length + 0.015 * longest, row, word, va="center", fontsize=10)
+    # few bars are not blown up
+    ax.set(xlim=(0, 1.12 * longest), ylim=(max(len(names), 3) - 0.4, -0.6), xticks=[])
+    ax.set_yticks(range(len(names)), names)
+    ax.spines[["bottom"]].set_visible(False)
+    ax.tick_params(length=0, labelcolor=LIGHT.ink)
