@@ -89,6 +89,14 @@ def test_a_motion_that_is_played_leaves_no_page_of_an_earlier_run_next_to_its_lo
     assert sorted(path.name for path in out.iterdir()) == ["log.npz", "notes.txt"]
 
 
+def test_a_motion_that_cannot_be_played_leaves_no_empty_folder(tmp_path, capsys):
+    motion, out = tmp_path / "motion.npz", tmp_path / "run"
+    write_gap_log(motion, commands_log({"rest": np.repeat(straight_start(Cable())[None], 4, axis=0)}, 0.5, Cable()))
+    for option, value in (("--cable", "nothing.toml"), ("--links", "2")):
+        assert main(["shape", "--motion", str(motion), option, value, "--out", str(out)]) == 2
+        assert value in capsys.readouterr().err and not out.exists()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -174,7 +174,7 @@ def page(tmp_path):
     write_page(
         tmp_path / "report.html",
         runs,
-        {"shapes": shapes, "total_s": 1.0},
+        shapes,
         about="A test & nothing else.",
         facts=facts,
         gif=tmp_path / "demo.gif",
@@ -253,7 +253,7 @@ def test_a_shape_name_cannot_break_the_page(tmp_path):
     write_page(
         tmp_path / "report.html",
         runs,
-        {"shapes": {}, "total_s": 1.0},
+        {},
         about="",
         facts={},
         gif=tmp_path / "demo.gif",

@@ -172,10 +172,10 @@ def test_pages_advise_only_commands_that_accept_the_file(tmp_path, capsys):
 
 
 def test_a_run_has_its_page(tmp_path, capsys):
-    from cablejax.commands.results import summarise, write_results
+    from cablejax.commands.results import numbers_of, write_results
 
     runs = demo_runs()
-    write_results(tmp_path, runs, summarise(runs, 1.0), believed=Cable(), about="Test.", facts={})
+    write_results(tmp_path, runs, numbers_of(runs), believed=Cable(), about="Test.", facts={})
     (tmp_path / "summary.json").write_text("{}")
     answer, page = view(capsys, tmp_path)
     assert answer["page"] == str(tmp_path / "report.html") and "The cable reaches" in page

@@ -79,8 +79,8 @@ def choose_device(device: Literal["auto", "cpu", "gpu"]) -> None:
     jax.config.update("jax_default_device", gpus[0])
 
 
-def output_folder(path: pathlib.Path, *, overwrite: bool) -> pathlib.Path:
-    """The folder, made if it is not there.
+def output_folder(path: pathlib.Path, *, overwrite: bool) -> None:
+    """Makes a folder for results if it is not there.
 
     Raises:
         UsageError: if it exists and holds anything, unless `overwrite`; or if it is a file.
@@ -90,7 +90,6 @@ def output_folder(path: pathlib.Path, *, overwrite: bool) -> pathlib.Path:
     if holds_anything(path) and not overwrite:
         raise UsageError(f"{path} exists and is not empty. Give another folder with --out, or add --overwrite.")
     path.mkdir(parents=True, exist_ok=True)
-    return path
 
 
 def output_file(path: pathlib.Path, *, overwrite: bool) -> pathlib.Path:

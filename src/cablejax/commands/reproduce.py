@@ -27,13 +27,9 @@ def command_line(command: Command, name: str) -> str:
         if value == field.default or field.name in ("json", "device", "overwrite"):
             continue
         option = f"--{field.name.strip('_').replace('_', '-')}"
-        if field.name in REPEATED:
-            words += [word for item in value for word in (option, *_words(item))]
-        else:
-            words += [
-                option,
-                *(word for item in (value if isinstance(value, tuple) else (value,)) for word in _words(item)),
-            ]
+        items = value if isinstance(value, tuple) else (value,)
+        for together in [(item,) for item in items] if field.name in REPEATED else [items]:
+            words += [option, *(word for item in together for word in _words(item))]
         if field.name in _NAMES_OR_FOLDERS:
             words[-1] = pathlib.Path(words[-1]).name
     return shlex.join(words)

@@ -17,19 +17,19 @@ from cablejax.report.animation import write_gif
 from cablejax.report.page import write_page
 
 
-def summarise(runs: Runs, total_s: float) -> dict[str, Any]:
-    """The summary of the runs; undefined numbers are null.
+def numbers_of(runs: Runs) -> dict[str, dict[str, float | None]]:
+    """The numbers of each shape's runs, as the summary has them; those that are undefined are None.
 
     Settling and planning times are those of the run with the residual, where there is one.
     """
-    shapes: dict[str, dict[str, float | None]] = {}
+    found: dict[str, dict[str, float | None]] = {}
     for shape in dict.fromkeys(shape for shape, _ in runs):
         with_residual, direct = runs.get((shape, "residual")), runs.get((shape, "direct"))
         main = with_residual or direct
         assert main is not None
         calls = main.mpc_ms[np.isfinite(main.mpc_ms)]
         p50, p95 = np.percentile(calls, [50, 95]) if len(calls) else (np.nan, np.nan)
-        shapes[shape] = {
+        found[shape] = {
             "initial_error_cm": _number(main.initial_error_cm),
             "terminal_error_cm": _number(with_residual.terminal_error_cm if with_residual else np.nan),
             "terminal_error_without_residual_cm": _number(direct.terminal_error_cm if direct else np.nan),
@@ -37,7 +37,7 @@ def summarise(runs: Runs, total_s: float) -> dict[str, Any]:
             "mpc_ms_p50": _number(p50),
             "mpc_ms_p95": _number(p95),
         }
-    return {"shapes": shapes, "total_s": round(total_s, 3)}
+    return found
 
 
 def table_of(summary: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
@@ -60,7 +60,7 @@ def table_of(summary: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
 def write_results(
     out: pathlib.Path,
     runs: Runs,
-    summary: Mapping[str, Any],
+    numbers: Mapping[str, Mapping[str, Any]],
     *,
     believed: Cable,
     about: str,
@@ -71,7 +71,7 @@ def write_results(
     Args:
         out: the folder.
         runs: the runs, by shape and method.
-        summary: of these runs.
+        numbers: of these runs, see `numbers_of`.
         believed: the cable that the model was trained on, which is what the gap log states.
         about: what plant and model these runs had.
         facts: settings to print on the page, with versions and machine.
@@ -86,7 +86,7 @@ def write_results(
     write_page(
         out / "report.html",
         runs,
-        summary,
+        numbers,
         about=about,
         facts={**facts, "versions": versions(), "machine": machine()},
         gif=out / "demo.gif",

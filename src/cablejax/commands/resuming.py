@@ -22,11 +22,11 @@ from cablejax.whole_file import DRAFT, sole_writer, whole_file
 SCHEMA = "cablejax-parts/1"
 """Marks the folder as ours; a folder of that name without it belongs to somebody else."""
 
-_NESTED = {"target": Target, "episode": Episode}
-_FIELDS = [
-    *(field.name for field in dataclasses.fields(ClosedLoopRun) if field.name not in _NESTED),
-    *(f"{group}.{field.name}" for group, cls in _NESTED.items() for field in dataclasses.fields(cls)),
-]
+_FIELDS = {
+    group: [field.name for field in dataclasses.fields(cls) if field.name not in ("target", "episode")]
+    for group, cls in (("", ClosedLoopRun), ("target.", Target), ("episode.", Episode))
+}
+"""Names of the fields of a run by what is put before them in its file."""
 _SETTINGS, _STATE, _RUN = "settings.json", "state.json", ".run.npz"
 
 
@@ -74,7 +74,8 @@ class Parts:
 
     def save(self, name: str, run: ClosedLoopRun) -> None:
         """Stores a run, whole or not at all."""
-        fields = _flatten(run)
+        groups = {"": run, "target.": run.target, "episode.": run.episode}
+        fields = {f"{group}{name}": getattr(groups[group], name) for group, names in _FIELDS.items() for name in names}
         text = {key: value for key, value in fields.items() if isinstance(value, (str, int)) or value is None}
         arrays = {key: value for key, value in fields.items() if key not in text}
         with whole_file(self.folder / f"{name}{_RUN}") as stream:
@@ -83,13 +84,11 @@ class Parts:
     def load(self, name: str) -> ClosedLoopRun | None:
         """A stored run; None if it is missing or damaged and has to be made again."""
         try:
-            arrays = read_npz(self.folder / f"{name}{_RUN}", ["text"], _FIELDS, text=["text"])
-            fields: dict[str, Any] = {**parse_json(str(arrays.pop("text"))), **arrays}
-            nested = {
-                group: cls(**{f.name: fields.pop(f"{group}.{f.name}") for f in dataclasses.fields(cls)})
-                for group, cls in _NESTED.items()
-            }
-            return ClosedLoopRun(**fields, **nested)
+            every = [f"{group}{name}" for group, names in _FIELDS.items() for name in names]
+            arrays = read_npz(self.folder / f"{name}{_RUN}", ["text"], every, text=["text"])
+            fields = {**parse_json(str(arrays["text"])), **arrays}
+            run, target, episode = ({n: fields[f"{group}{n}"] for n in names} for group, names in _FIELDS.items())
+            return ClosedLoopRun(**run, target=Target(**target), episode=Episode(**episode))
         except FileNotFoundError:
             return None
         except (ValueError, TypeError, KeyError, AttributeError) as error:
@@ -150,10 +149,9 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
     begun = differing == []
     if not begun:
         if differing and not overwrite:
-            names = ", ".join(differing)
             raise UsageError(
-                f"{out} holds an unfinished run with other options ({names}): run it with these to finish it, give "
-                "another folder with --out, or add --overwrite."
+                f"{out} holds an unfinished run with other options ({', '.join(differing)}): run it with these to "
+                "finish it, give another folder with --out, or add --overwrite."
             )
         if differing is None and parts.folder.is_dir():
             parts.remove()  # nothing but what a kill left
@@ -179,15 +177,3 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
 def _stamps(folder: pathlib.Path) -> dict[str, int]:
     """When each file in a folder was last written, 0 for folders."""
     return {file.name: 0 if file.is_dir() else file.stat().st_mtime_ns for file in folder.iterdir()}
-
-
-def _flatten(run: ClosedLoopRun) -> dict[str, Any]:
-    """The fields of a run, those of its target and episode as "target.name" and so on."""
-    flat = {}
-    for field in dataclasses.fields(run):
-        value = getattr(run, field.name)
-        if field.name in _NESTED:
-            flat |= {f"{field.name}.{inner.name}": getattr(value, inner.name) for inner in dataclasses.fields(value)}
-        else:
-            flat[field.name] = value
-    return flat

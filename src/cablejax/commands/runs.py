@@ -13,7 +13,7 @@ import numpy as np
 from cablejax.cable import Cable, Discretisation
 from cablejax.commands.cable import check_verdicts
 from cablejax.commands.options import UsageError, say
-from cablejax.commands.results import summarise, write_results
+from cablejax.commands.results import numbers_of, write_results
 from cablejax.commands.resuming import Parts
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Method, Model, check_fit, enters, not_within_reach, shape_once
@@ -121,9 +121,9 @@ def shape_and_report(job: Job, out: pathlib.Path, parts: Parts, *, facts: Mappin
                 parts.save(f"{target.name}-{method}", run)
             runs[target.name, method] = run
             say(f"{time.perf_counter() - begin:5.0f} s  {METHOD_LABEL[method]:22s}{run.verdict()}")
-    summary = summarise(runs, total_s=0.0)
-    write_results(out, runs, summary, believed=job.model.cable, about=about(job), facts=facts)
-    summary["total_s"] = round(time.perf_counter() - begin, 3)
+    numbers = numbers_of(runs)
+    write_results(out, runs, numbers, believed=job.model.cable, about=about(job), facts=facts)
+    summary = {"shapes": numbers, "total_s": round(time.perf_counter() - begin, 3)}
     write_json(out / "summary.json", summary)
     return summary
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from cablejax.commands.cable import find_cable
-from cablejax.commands.options import Command, UsageError, output_folder, text_table
+from cablejax.commands.options import Command, UsageError, text_table
 from cablejax.limits import require
 from cablejax.solver_names import SolverName
 
@@ -132,24 +132,22 @@ class Shape(Command):
 
     def _play(self, path: pathlib.Path, effects: tuple[GivenEffect, ...]):
         """Plays a motion on the plant and writes the log of it."""
+        from cablejax.commands.resuming import unfinished
         from cablejax.commands.runs import plant_of
         from cablejax.gaplog import read_gap_log, write_gap_log
         from cablejax.simulate.plant import Plant
         from cablejax.simulate.play import play
 
-        commands, out = read_gap_log(path), output_folder(self.out, overwrite=self.overwrite)
-        cable = find_cable(path if self.cable is None else self.cable)
+        commands, cable = read_gap_log(path), find_cable(path if self.cable is None else self.cable)
         plant = plant_of(cable, effects, links=self.links, seed=self.seed)
-        log = play(
-            Plant(plant),
-            commands,
-            source=f"contact plant, {', '.join(map(str, effects)) or 'no effect'}",
-            noise=1e-3 * (self.noise_mm or 0.0),
-            seed=self.seed,
-        )
-        for old in ("report.html", "summary.json", "demo.gif"):  # of another run, whose log goes
-            (out / old).unlink(missing_ok=True)
-        written = write_gap_log(out / "log.npz", log, overwrite=True)
+        noise = 1e-3 * (self.noise_mm or 0.0)
+        settings = {"motion": commands.meta, "plant": dataclasses.asdict(plant), "noise": noise}
+        with unfinished(self.out, settings, overwrite=self.overwrite):
+            source = f"contact plant, {', '.join(map(str, effects)) or 'no effect'}"
+            log = play(Plant(plant), commands, source=source, noise=noise, seed=self.seed)
+            for old in ("report.html", "summary.json", "demo.gif"):  # of another run, whose log goes
+                (self.out / old).unlink(missing_ok=True)
+            written = write_gap_log(self.out / "log.npz", log, overwrite=True)
         seconds = float(sum(log.time[e, n - 1] for e, n in enumerate(log.episode_length)))
         result = {"log": str(written), "episodes": len(log.episode_length), "seconds": seconds}
         return result, f"{written}\n\nDiagnose it with `cablejax diagnose {shlex.quote(str(written))}`."

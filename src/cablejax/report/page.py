@@ -65,7 +65,7 @@ _SECTIONS: tuple[tuple[str, Callable[[Any], Figure], str], ...] = (
 def write_page(
     path: str | os.PathLike[str],
     runs: Runs,
-    summary: Mapping[str, Any],
+    numbers: Mapping[str, Mapping[str, Any]],
     *,
     about: str,
     facts: Mapping[str, str],
@@ -76,7 +76,7 @@ def write_page(
     Args:
         path: the file to write.
         runs: the runs.
-        summary: the demo's summary: `{"shapes": {name: {...}}, "total_s": ...}`.
+        numbers: of each shape for the table of results, by the keys of `_COLUMNS`.
         about: what plant and model these runs had, in a sentence or two.
         facts: versions, seed, machine: whatever is needed to make the page again, in order.
         gif: the animation's file, inlined for readers without scripts.
@@ -95,7 +95,7 @@ def write_page(
         label=METHOD_LABEL,
         shapes=pairs,
         columns=_COLUMNS,
-        results={shape: _cells(values) for shape, values in summary["shapes"].items()},
+        results={shape: _cells(values) for shape, values in numbers.items()},
         figures=_figures(runs),
         made=facts,
         fallback="data:image/gif;base64," + base64.b64encode(pathlib.Path(gif).read_bytes()).decode(),
