@@ -140,5 +140,5 @@ def test_what_is_no_pickle_is_reported(tmp_path):
     for data in (b"", b"\x93NUMPY", pickle.dumps(NUMBERS)[:200], b"\x80\x04]\x94h\x07a."):
         with pytest.raises(ValueError, match="no pickle, or a damaged one"):
             read_pickle(written(tmp_path, data))
-    with pytest.raises(ValueError, match="does not exist"):
+    with pytest.raises(FileNotFoundError, match="no file"):
         read_pickle(tmp_path / "absent.pkl")

@@ -25,8 +25,9 @@ from cablejax.recordings.frames import (
     require_readable,
     require_rigid,
 )
+from cablejax.recordings.prepare import Setup
 from cablejax.recordings.take import Take
-from cablejax.recordings.units import metres_per, recognised_unit, require_metres
+from cablejax.recordings.units import METRES, recognised_unit, require_metres
 from cablejax.simulate.pose import integrate_pose
 from recording_cases import swinging, take
 
@@ -207,14 +208,14 @@ def test_quaternions_read_in_another_way_are_named_where_only_the_cable_shows_it
 
 
 def test_units_are_recognised_by_the_length_of_the_cable():
-    assert [metres_per(unit) for unit in ("m", "cm", "mm", "in")] == [1, 0.01, 0.001, 0.0254]
+    assert METRES == {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
     assert recognised_unit(1037.0, (0.3, 3.0)) == ("mm",)
     assert recognised_unit(41.0, (0.3, 3.0)) == ("cm", "in")
     require_metres(1.0, "m")
     with pytest.raises(ValueError, match=r"measures 1037 m, expected 0.05 to 20.*1.04 m if they are in mm"):
         require_metres(1037.0, "m")
     with pytest.raises(ValueError, match="'furlong', expected one of m, cm, mm, in"):
-        metres_per("furlong")
+        Setup(unit="furlong")
 
 
 def test_a_take_of_wrong_shape_is_refused():

@@ -52,27 +52,16 @@ def frozen(points: Float[np.ndarray, "T N D"]) -> Bool[np.ndarray, "T N"]:
     return found
 
 
-def far_keypoint(
-    keypoints: Float[np.ndarray, "T N D"], grippers: Float[np.ndarray, "T Q D"], length: float
-) -> tuple[int, int, float] | None:
-    """The sample, index and distance [m] of the keypoint farthest out of the cable's reach, or None.
+def out_of_reach(
+    keypoints: Float[np.ndarray, "*T N D"], grippers: Float[np.ndarray, "*T Q D"], length: float
+) -> Bool[np.ndarray, "*T N"]:
+    """Which keypoints are farther from both grippers than `REACH`.
 
     Args:
         keypoints: [m], NaN = not observed.
-        grippers: positions [m].
+        grippers: positions [m], NaN = not known.
         length: of the cable [m].
     """
-    distance = _distance(keypoints, grippers)
-    sample, index = np.unravel_index(int(distance.argmax()), distance.shape)
-    if distance[sample, index] <= REACH * length + 1.0:
-        return None
-    return int(sample), int(index), float(distance[sample, index])
-
-
-def out_of_reach(
-    keypoints: Float[np.ndarray, "*T N D"], grippers: Float[np.ndarray, "*T Q D"], length: float
-) -> np.ndarray:
-    """Which keypoints are out of the cable's reach; see `far_keypoint`."""
     return _distance(keypoints, grippers) > REACH * length + 1.0
 
 
@@ -89,7 +78,9 @@ def ends_exchanged(keypoints: Float[np.ndarray, "N D"], grippers: Float[np.ndarr
     return own > AT_GRIPPER * length and other < AT_GRIPPER * length
 
 
-def _distance(keypoints: np.ndarray, grippers: np.ndarray) -> np.ndarray:
+def _distance(
+    keypoints: Float[np.ndarray, "*T N D"], grippers: Float[np.ndarray, "*T Q D"]
+) -> Float[np.ndarray, "*T N"]:
     """Of each keypoint from the nearer gripper [m]; 0 where either was not observed."""
     offset = np.asarray(keypoints, float)[..., :, None, :] - np.asarray(grippers, float)[..., None, :, :]
     return np.nan_to_num(np.linalg.norm(offset, axis=-1).min(axis=-1), nan=0.0)
@@ -118,12 +109,14 @@ def geometry_fault(log: GapLog) -> str | None:
                 f"Field 'keypoints' is the same to the last digit in all {samples} samples of episode {episode}, but a "
                 f"gripper moves by {moved:.3g} m: expected measured keypoints, and NaN where one was not observed."
             )
-        if far := far_keypoint(points, pose[..., :dimension], length):
-            sample, index, distance = far
+        grippers = pose[..., :dimension]
+        if out_of_reach(points, grippers, length).any():
+            distance = _distance(points, grippers)
+            sample, index = np.unravel_index(int(distance.argmax()), distance.shape)
             return (
-                f"Field 'keypoints' has keypoint {index} of episode {episode} {distance:.3g} m away from both grippers "
-                f"at {log.time[episode, sample]:.3g} s, but the cable is {length:g} m long: expected metres, and NaN "
-                "where a keypoint was not observed."
+                f"Field 'keypoints' has keypoint {index} of episode {episode} {distance.max():.3g} m away from both "
+                f"grippers at {log.time[episode, sample]:.3g} s, but the cable is {length:g} m long: expected metres, "
+                "and NaN where a keypoint was not observed."
             )
     if dimension != 2 or log.gripper_pose.shape[2] != 2 or log.keypoints.shape[2] < _FEWEST:
         return None

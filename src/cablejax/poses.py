@@ -213,8 +213,4 @@ def twists(time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T Q P"]) -> F
         angle = 2 * np.arctan2(sine, turn[..., :1])
         vector = turn[..., 1:] * np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
         change = np.concatenate([np.diff(pose[..., :3], axis=0), vector], axis=-1)
-    return (
-        np.concatenate([change / interval, np.zeros_like(change[:1])])
-        if len(change)
-        else np.zeros((1, pose.shape[1], 3 if pose.shape[-1] == 3 else 6))
-    )
+    return np.concatenate([change / interval, np.zeros((1, *change.shape[1:]))])

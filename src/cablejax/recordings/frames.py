@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from cablejax.arrays import quaternion_product
 from cablejax.poses import rotated, unwrapped
 from cablejax.recordings.take import Take
 
@@ -88,12 +89,11 @@ def into_frame(take: Take, frame: Frame) -> Take:
     if pose is not None:
         mirror = np.diag([1.0, np.linalg.det(matrix), 1.0])
         turn = Rotation.from_matrix(mirror @ matrix).as_quat(scalar_first=True)
-        w, v = pose[..., 3:4], pose[..., 4:]
         # the frame is turned, and the gripper with it: its x axis stays the one along the cable
-        vector = turn[0] * v + w * turn[1:] + np.cross(turn[1:], v)
+        turned = quaternion_product(turn, pose[..., 3:])
         # a reflection M turns a rotation about the axis a by an angle into that about -M a by the same angle
-        vector = np.linalg.det(mirror) * vector @ mirror
-        pose = np.concatenate([pose[..., :3] @ matrix.T, turn[0] * w - v @ turn[1:, None], vector], axis=-1)
+        vector = np.linalg.det(mirror) * turned[..., 1:] @ mirror
+        pose = np.concatenate([pose[..., :3] @ matrix.T, turned[..., :1], vector], axis=-1)
     return dataclasses.replace(take, keypoints=take.keypoints @ matrix.T, gripper_pose=pose)
 
 

@@ -90,10 +90,9 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
             )
         # what was cut is still one recording
         take = dataclasses.replace(take, labels={"recording": take.name, **take.labels})
-        if len(kept) == 1:
-            parts.append(take.part(*kept[0], take.name))
-        else:
-            parts.extend(take.part(a, b, f"{take.name}/{index}") for index, (a, b) in enumerate(kept, 1))
+        for index, (a, b) in enumerate(kept, 1):
+            name = take.name if len(kept) == 1 else f"{take.name}/{index}"
+            parts.append(dataclasses.replace(take.part(slice(a, b)), name=name))
     if not parts:
         steps = np.concatenate([np.diff(take.time) for take in takes])
         apart = f" Its samples are {np.median(steps):.3g} s apart: check the unit of time." if len(steps) else ""
@@ -106,17 +105,12 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
 
 def _require_grippers(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) -> None:
     for gripper in (0, 1):
-        if on_grippers is None:
-            seen = any(
-                take.gripper_pose is not None and np.isfinite(take.gripper_pose[:, gripper]).all(axis=-1).any()
-                for take in takes
-            )
+        ends = (np.split(_ends(take, on_grippers), 2, axis=1)[gripper] for take in takes)
+        if not any(np.isfinite(end).all(axis=(1, 2)).any() for end in ends):
             what = "has no pose in any sample"
-        else:
-            pair = on_grippers[:2] if gripper == 0 else on_grippers[2:]
-            seen = any(np.isfinite(take.keypoints[:, pair]).all(axis=(1, 2)).any() for take in takes)
-            what = f"is located by keypoints {pair[0]} and {pair[1]}, which are never observed together"
-        if not seen:
+            if on_grippers is not None:
+                first, second = on_grippers[2 * gripper : 2 * gripper + 2]
+                what = f"is located by keypoints {first} and {second}, which are never observed together"
             raise ValueError(
                 f"Gripper {gripper} {what}. Both ends must be known: name the columns or topic of its pose, or two "
                 "markers that are on it."
@@ -131,10 +125,15 @@ def _fillable(take: Take) -> float:
     return max(FILLED + 1e-9, one_missing)
 
 
-def _known(take: Take, on_grippers: tuple[int, ...] | None) -> np.ndarray:
+def _ends(take: Take, on_grippers: tuple[int, ...] | None) -> np.ndarray:
+    """What locates the grippers, both alike, one after the other: their poses, or the keypoints on them."""
     ends = take.gripper_pose if on_grippers is None else take.keypoints[:, on_grippers]
     assert ends is not None
-    return np.asarray(np.isfinite(ends).all(axis=(1, 2)))
+    return ends
+
+
+def _known(take: Take, on_grippers: tuple[int, ...] | None) -> Bool[np.ndarray, " T"]:
+    return np.asarray(np.isfinite(_ends(take, on_grippers)).all(axis=(1, 2)))
 
 
 def _without_repeats(take: Take, reports: list[str]) -> Take:
@@ -152,9 +151,7 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
             f"after each new sample: the tracker is about {slower} times slower than the recording. Only new samples "
             "are kept."
         )
-        new = np.append(True, ~same)
-        pose = None if take.gripper_pose is None else take.gripper_pose[new]
-        return dataclasses.replace(take, time=take.time[new], keypoints=take.keypoints[new], gripper_pose=pose)
+        return take.part(np.append(True, ~same))
     if same.mean() > _HELD_PART:
         return take
     repeated = np.zeros(len(take.time), bool)
@@ -168,13 +165,9 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
         f"Take {take.name}: {int(repeated.sum())} samples repeat the previous one to the last digit although the "
         "recording otherwise moves: they are treated as not observed."
     )
-    points = take.keypoints.copy()
-    points[repeated] = np.nan
-    pose = take.gripper_pose
-    keep = ~repeated
-    if pose is None:
-        return dataclasses.replace(take, keypoints=points)
-    return dataclasses.replace(take, time=take.time[keep], keypoints=take.keypoints[keep], gripper_pose=pose[keep])
+    if take.gripper_pose is None:  # a cut where the grippers are not known either
+        return dataclasses.replace(take, keypoints=np.where(repeated[:, None, None], np.nan, take.keypoints))
+    return take.part(~repeated)
 
 
 def _moves(take: Take, first: int, last: int, distance: float) -> bool:
@@ -213,8 +206,7 @@ def _filled(take: Take, on_grippers: tuple[int, ...] | None) -> tuple[Take, int]
             few[a:b] = True
     if not few.any():
         return take, 0
-    ends = take.keypoints[:, on_grippers] if on_grippers is not None else take.gripper_pose
-    assert ends is not None
+    ends = _ends(take, on_grippers)
     values = ends.copy()
     between = positions_at if on_grippers is not None else poses_at
     for part in range(values.shape[1]):

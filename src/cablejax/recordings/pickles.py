@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import math
 import os
-import pathlib
 import pickle
 import pickletools
 from collections.abc import Callable
@@ -18,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-LARGEST_FILE = 256 * 2**20
-"""Bytes of the largest pickle read: the blocks of a recording have some hundred kilobytes."""
+from cablejax.text_file import read_bytes
+
 MOST_DEPTH, MOST_ENTRIES = 3, 10_000
 """How deep lists may hold each other, and how long one may be."""
 
@@ -83,7 +82,7 @@ def _from_buffer(data: Any, kind: Any, shape: Any, order: Any = "C") -> np.ndarr
     if not isinstance(kind, _Type) or not isinstance(data, (bytes, bytearray)):
         raise UnsafePickleError(
             f"it has an array whose numbers are a {type(data).__name__}, expected bytes; arrays of objects are not "
-            f"read."
+            "read."
         )
     if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape) or len(shape) > 8:
         raise UnsafePickleError(f"it has an array of shape {shape!r}, expected a few integers >= 0.")
@@ -170,15 +169,11 @@ def read_pickle(path: str | os.PathLike[str]) -> Any:
         What was pickled, with read-only arrays; numbers and strings as they are.
 
     Raises:
-        UnsafePickleError: the file asks for anything else, or is too large to be a recording; says for what.
-        ValueError: the file is no pickle.
+        UnsafePickleError: the file asks for anything else; says for what.
+        ValueError: the file is no pickle, or see `read_bytes`.
+        FileNotFoundError: there is no such file.
     """
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path} does not exist, expected a pickle of an array.")
-    if (size := path.stat().st_size) > LARGEST_FILE:
-        raise UnsafePickleError(f"{path} has {size} bytes, expected at most {LARGEST_FILE}: it was not read.")
-    data = path.read_bytes()
+    data = read_bytes(path)
     refused = f"{path} was not read: "
     try:
         _check_opcodes(data)

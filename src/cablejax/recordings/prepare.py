@@ -23,7 +23,7 @@ from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
 from cablejax.recordings.strays import without_held, without_jumps, without_outliers, without_stretched
 from cablejax.recordings.take import Take, spacing, typical_spacing
-from cablejax.recordings.units import METRES, metres_per, recognised_unit, require_metres
+from cablejax.recordings.units import METRES, recognised_unit, require_metres
 
 _USUAL_LENGTH = 0.3, 3.0
 """Lengths of a cable [m] by which an unstated unit is recognised."""
@@ -58,8 +58,8 @@ class Setup:
     hangs: bool = True
 
     def __post_init__(self):
-        if self.unit is not None:
-            metres_per(self.unit)
+        if self.unit not in (None, *METRES):
+            raise ValueError(f"The unit of length is {self.unit!r}, expected one of {', '.join(METRES)}.")
         if self.on_grippers not in ("pairs", "ends"):
             raise ValueError(f"on_grippers is {self.on_grippers!r}, expected 'pairs' or 'ends'.")
 
@@ -211,10 +211,10 @@ def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...],
                 + (f"It may be in {' or in '.join(candidates)}: state which. " if candidates else "")
                 + "Name the unit of length, or check the order of the coordinates."
             )
-    require_metres(length * METRES[unit], unit)
+    scale = METRES[unit]
+    require_metres(length * scale, unit)
     if unit == "m":
         return takes, repairs
-    scale = METRES[unit]
 
     def scaled(take: Take) -> Take:
         pose = take.gripper_pose

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable_length import STRETCH, ring_chords
+from cablejax.limits import counted
 from cablejax.log_geometry import frozen
 from cablejax.recordings.take import Take, spacing, typical_spacing
 
@@ -38,7 +39,7 @@ def without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[st
     if not count:
         return takes, []
     return tuple(kept), [
-        f"{count} keypoint{'s' if count > 1 else ''} lay up to {farthest:.3g} m from the rest of the cable, which is "
+        f"{counted(count, 'keypoint')} lay up to {farthest:.3g} m from the rest of the cable, which is "
         f"{length:.3g} m long: treated as not observed."
     ]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from cablejax.limits import require
 
@@ -50,12 +50,10 @@ class Take:
                 "with x, y, theta in the plane, or x, y, z, qw, qx, qy, qz in space."
             )
 
-    def part(self, begin: int, end: int, name: str) -> Take:
-        """The samples from `begin` up to `end` as a take of their own."""
-        pose = None if self.gripper_pose is None else self.gripper_pose[begin:end]
-        return dataclasses.replace(
-            self, name=name, time=self.time[begin:end], keypoints=self.keypoints[begin:end], gripper_pose=pose
-        )
+    def part(self, samples: slice | Bool[np.ndarray, " T"]) -> Take:
+        """Some of the samples, as a take of the same name."""
+        pose = None if self.gripper_pose is None else self.gripper_pose[samples]
+        return dataclasses.replace(self, time=self.time[samples], keypoints=self.keypoints[samples], gripper_pose=pose)
 
 
 def require_increasing(

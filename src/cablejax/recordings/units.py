@@ -14,17 +14,6 @@ PLAUSIBLE = (LIMITS["recorded_length"].low, LIMITS["recorded_length"].high)
 """Lengths [m] that a cable between two arms may have."""
 
 
-def metres_per(unit: str) -> float:
-    """Metres per unit of length.
-
-    Raises:
-        ValueError: an unknown unit; names the known ones.
-    """
-    if unit not in METRES:
-        raise ValueError(f"The unit of length is {unit!r}, expected one of {', '.join(METRES)}.")
-    return METRES[unit]
-
-
 def recognised_unit(length: float, plausible: tuple[float, float] = PLAUSIBLE) -> tuple[str, ...]:
     """The units in which this cable length is plausible; several if it is ambiguous."""
     return tuple(name for name, metres in METRES.items() if plausible[0] <= length * metres <= plausible[1])
