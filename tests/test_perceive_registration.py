@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cablejax.perceive import RegistrationConfig, register
-from cablejax.perceive.tracker import padded
+from cablejax.perceive.initial import padded
 from perceive_cases import ARCH, CAPACITY, REGISTRATION, S_SHAPE, cloud, mean_error, moved, shape, start_angles
 
 SIGMA = 0.015

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from cablejax.perceive import Status, Tracker, TrackerConfig, track
-from cablejax.perceive.initial import cloud_path, path_length
-from cablejax.perceive.tracker import padded
+from cablejax.perceive.initial import cloud_path, padded, path_length
 from perceive_cases import ARCH, CAPACITY, S_SHAPE, TRACKER, cloud, mean_error, moved, shape
 
 FRAMES = 12

@@ -28,7 +28,7 @@ from cablejax.dataset.store import Store
 from cablejax.limits import shown
 from cablejax.provenance import package_versions
 from cablejax.text_file import differences, read_json, version_of
-from cablejax.whole_file import draft_folder
+from cablejax.whole_file import draft_folder, whole_file
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 """Packages whose versions decide the content, besides cablejax itself: those that begin a store must complete it."""
@@ -148,21 +148,16 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
             f"{place} was begun with other packages: {changes}. Trajectories of different versions cannot be mixed: "
             "install those versions, or generate in another folder. Nothing was changed."
         )
-    faulty = [name for name in _arrays(config) if _fault(store, name)]
-    if isinstance(place, Bucket):
-        if faulty:
-            descriptions = _descriptions(config, versions)
-            for name in faulty:
-                place.write(f"{name}/zarr.json", descriptions[f"{name}/zarr.json"])
-            store = _recorded(place, "r+")
-    elif faulty:
-        with draft_folder(place) as draft:
-            _fill(draft, config, versions)
-            for name in faulty:  # the trajectories stay: each is checked against its digest
-                (place / name).mkdir(exist_ok=True)
-                os.replace(draft / name / "zarr.json", place / name / "zarr.json")
-        store = _recorded(place, "r+")
-    return store
+    faulty = [f"{name}/zarr.json" for name in _arrays(config) if _fault(store, name)]
+    descriptions = _descriptions(config, versions) if faulty else {}
+    for name in faulty:  # the trajectories stay: each is checked against its digest
+        if isinstance(place, Bucket):
+            place.write(name, descriptions[name])
+            continue
+        (place / name).parent.mkdir(exist_ok=True)
+        with whole_file(place / name) as stream:
+            stream.write(descriptions[name])
+    return _recorded(place, "r+") if faulty else store
 
 
 def _changes(stored: Mapping[str, Any], asked: Mapping[str, Any]) -> str:

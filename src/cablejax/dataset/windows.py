@@ -119,27 +119,14 @@ def draw_windows(
 
 def mirrored(window: Window) -> Window:
     """The same motion seen in a mirror, y -> -y: as likely as the original for a uniform straight cable."""
-    point, pose = jnp.array([1.0, -1.0]), jnp.array([1.0, -1.0, -1.0])
-    return Window(
-        history=History(
-            keypoints=(window.history.keypoints * point).astype(window.history.keypoints.dtype),
-            gripper_pose=(window.history.gripper_pose * pose).astype(window.history.gripper_pose.dtype),
-            cable=window.history.cable,
-        ),
-        twist=(window.twist * pose).astype(window.twist.dtype),
-        future=(window.future * point).astype(window.future.dtype),
-    )
+    past, pose = window.history, jnp.array([1.0, -1.0, -1.0], window.future.dtype)
+    past = dataclasses.replace(past, keypoints=past.keypoints * pose[:2], gripper_pose=past.gripper_pose * pose)
+    return Window(history=past, twist=window.twist * pose, future=window.future * pose[:2])
 
 
 def reversed_ends(window: Window) -> Window:
     """The same motion with the cable counted from its other end: the tangent, and so theta, turns by pi."""
-    turn = jnp.asarray([0.0, 0.0, jnp.pi], window.history.gripper_pose.dtype)
-    return Window(
-        history=History(
-            keypoints=window.history.keypoints[..., ::-1, :],
-            gripper_pose=window.history.gripper_pose[..., ::-1, :] + turn,
-            cable=window.history.cable,
-        ),
-        twist=window.twist[..., ::-1, :],
-        future=window.future[..., ::-1, :],
-    )
+    past = window.history
+    turned = past.gripper_pose[..., ::-1, :] + jnp.array([0.0, 0.0, jnp.pi], past.gripper_pose.dtype)
+    past = dataclasses.replace(past, keypoints=past.keypoints[..., ::-1, :], gripper_pose=turned)
+    return Window(history=past, twist=window.twist[..., ::-1, :], future=window.future[..., ::-1, :])

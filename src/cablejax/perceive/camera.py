@@ -93,7 +93,9 @@ class DepthCamera:
                 "on the table: expected at most half of that (CameraConfig.range_noise, --noise-mm)."
             )
         self.config, self.chain = config, chain
-        self.position, self._rays = _pixels(config)
+        self._axes, self._focal = _axes(config), 0.5 * config.resolution[1] / np.tan(0.5 * config.field_of_view)
+        self.position = np.array([*config.centre, 0.0]) - config.distance * self._axes[0]
+        self._rays = _rays(config, self._axes, self._focal)
         self.model = _scene(config, chain)
         self._data = mujoco.MjData(self.model)
         bodies = [self.model.body(i).name for i in range(self.model.nbody)]
@@ -167,10 +169,7 @@ class DepthCamera:
 
     def _near_cable(self, nodes: np.ndarray) -> np.ndarray:
         """Pixels that may see the cable: those around its projection."""
-        config = self.config
-        across, down = config.resolution
-        sight, right, below = _axes(config)
-        focal = 0.5 * down / np.tan(0.5 * config.field_of_view)
+        (across, down), (sight, right, below), focal = self.config.resolution, self._axes, self._focal
         steps = np.linspace(0.0, 1.0, 4, endpoint=False)[:, None, None]
         points = ((1.0 - steps) * nodes[:-1] + steps * nodes[1:]).reshape(-1, 3)
         offset = np.concatenate([points, nodes[-1:]]) - self.position
@@ -215,11 +214,9 @@ def _axes(config: CameraConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return -away, right, np.cross(-away, right)
 
 
-def _pixels(config: CameraConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Position of the camera [m] and unit direction of every pixel's ray, rows first, shape [pixels, 3]."""
-    sight, right, below = _axes(config)
-    across, down = config.resolution
-    focal = 0.5 * down / np.tan(0.5 * config.field_of_view)
+def _rays(config: CameraConfig, axes: tuple[np.ndarray, ...], focal: float) -> Float[np.ndarray, "pixels 3"]:
+    """Unit direction of every pixel's ray, rows first; `focal` is the focal length [pixels]."""
+    (across, down), (sight, right, below) = config.resolution, axes
     u = (np.arange(across) - 0.5 * (across - 1)) / focal
     v = (np.arange(down) - 0.5 * (down - 1)) / focal
     rays = sight + u[None, :, None] * right + v[:, None, None] * below
@@ -229,7 +226,7 @@ def _pixels(config: CameraConfig) -> tuple[np.ndarray, np.ndarray]:
             f"A camera tilted by {config.tilt:.2f} rad with a field of view of {config.field_of_view:.2f} rad looks "
             "over the table's horizon: tilt it less or narrow its field of view."
         )
-    return np.array([*config.centre, 0.0]) - config.distance * sight, rays
+    return rays
 
 
 def _scene(config: CameraConfig, chain: Discretisation) -> mujoco.MjModel:

@@ -9,6 +9,7 @@ the cloud wins.
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from cablejax.arrays import wrapped
+from cablejax.limits import LIMITS
 from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
 
 CELL = 0.01
@@ -44,6 +46,48 @@ FINALISTS, REFINEMENTS = 4, 8
 """How many guesses are refined with all points, and by how many iterations."""
 SAME = 0.01
 """Mean distance of keypoints, in lengths, up to which two fits are the same."""
+
+
+class PaddedCloud(NamedTuple):
+    """A cloud on the table in a fixed number of rows.
+
+    Attributes:
+        points: [m], zeros where `mask` is false, float32, shape [S, 2].
+        mask: which rows are points, shape [S].
+        dropped: points that were not finite, or farther away than any camera sees.
+    """
+
+    points: Float[np.ndarray, "S 2"]
+    mask: Bool[np.ndarray, " S"]
+    dropped: int
+
+
+def padded(points: Float[np.ndarray, "n D"], capacity: int) -> PaddedCloud:
+    """The finite points of a cloud in `capacity` rows: a random part of them if there are more. Deterministic.
+
+    Args:
+        points: positions [m], shape [n, 2] or [n, 3], of which z is left out; n may be 0.
+        capacity: rows S of the result, the same for every frame, so that nothing is compiled twice.
+
+    Raises:
+        ValueError: the points have another shape or are not numbers.
+    """
+    array = np.asarray(points)
+    if array.size == 0:
+        array = np.zeros((0, 2))
+    if array.ndim != 2 or array.shape[1] not in (2, 3) or not np.issubdtype(array.dtype, np.number):
+        raise ValueError(
+            f"A cloud has shape {array.shape} and type {array.dtype}, expected numbers of shape [n, 2] or [n, 3]: one "
+            "row per point, in metres, in the frame of the grippers."
+        )
+    # cameras report what they do not see as not finite, or as a number without meaning
+    finite = (np.abs(array) <= LIMITS["coordinate"].high).all(axis=1)
+    kept = array[finite, :2].astype(np.float32)
+    if len(kept) > capacity:
+        kept = kept[np.random.default_rng(0).choice(len(kept), capacity, replace=False)]
+    rows = np.zeros((capacity, 2), np.float32)
+    rows[: len(kept)] = kept
+    return PaddedCloud(rows, np.arange(capacity) < len(kept), int(np.sum(~finite)))
 
 
 def cloud_path(
@@ -151,8 +195,9 @@ def guessed_fits(
     poses[:, 1, 2] = pose[1, 2] + 2 * np.pi * np.round((turn - between) / (2 * np.pi))
     sigma = config.length * np.where(np.arange(len(tangents)) < n_paths, PATH_SIGMA, GUESS_SIGMA)
 
-    angles, mask = np.diff(tangents, axis=1), np.arange(SAMPLE) < len(present)
-    fits = _register_all(config, _sample(present), mask, poses, angles, sigma, reach, ITERATIONS)
+    angles, sample = np.diff(tangents, axis=1), padded(present, SAMPLE)
+    cloud = jnp.asarray(sample.points, float)
+    fits = _register_all(config, cloud, sample.mask, poses, angles, sigma, reach, ITERATIONS)
     order = np.argsort(-_merit(config, fits), kind="stable")
     return jax.tree.map(lambda leaf: np.asarray(leaf)[order], fits)
 
@@ -171,13 +216,6 @@ def _merit(config: RegistrationConfig, fits: CurveFit) -> np.ndarray:
     """Log posterior of every fit, minus infinity where the curve does not end in the gripper."""
     merit = np.asarray(fits.log_posterior, float)
     return np.where(np.isfinite(merit) & (np.asarray(fits.gap) < 0.02 * config.length), merit, -np.inf)
-
-
-def _sample(points: np.ndarray) -> np.ndarray:
-    """As many of the points as the guesses are judged by, evenly taken, padded with zeros."""
-    if len(points) > SAMPLE:
-        points = points[np.random.default_rng(0).choice(len(points), SAMPLE, replace=False)]
-    return np.concatenate([points, np.zeros((SAMPLE - len(points), 2))])
 
 
 def _bowed_profiles(config: RegistrationConfig, pose: np.ndarray) -> list[np.ndarray]:

@@ -3,61 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from cablejax.limits import LIMITS
 from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState, judge, quality, track
-from cablejax.perceive.initial import cloud_path, first_fit, path_length
+from cablejax.perceive.initial import PaddedCloud, cloud_path, first_fit, padded, path_length
 from cablejax.poses import planar_rows
 
 # Lengths of the cable over which a cloud and the grippers can hardly extend.
 _FARTHEST = 4.0
-
-
-class PaddedCloud(NamedTuple):
-    """A cloud on the table in a fixed number of rows.
-
-    Attributes:
-        points: [m], zeros where `mask` is false, float32, shape [S, 2].
-        mask: which rows are points, shape [S].
-        dropped: points that were not finite, or farther away than any camera sees.
-    """
-
-    points: Float[np.ndarray, "S 2"]
-    mask: Bool[np.ndarray, " S"]
-    dropped: int
-
-
-def padded(points: Float[np.ndarray, "n D"], capacity: int) -> PaddedCloud:
-    """The finite points of a cloud in `capacity` rows: a random part of them if there are more. Deterministic.
-
-    Args:
-        points: positions [m], shape [n, 2] or [n, 3], of which z is left out; n may be 0.
-        capacity: rows S of the result, the same for every frame, so that nothing is compiled twice.
-
-    Raises:
-        ValueError: the points have another shape or are not numbers.
-    """
-    array = np.asarray(points)
-    if array.size == 0:
-        array = np.zeros((0, 2))
-    if array.ndim != 2 or array.shape[1] not in (2, 3) or not np.issubdtype(array.dtype, np.number):
-        raise ValueError(
-            f"A cloud has shape {array.shape} and type {array.dtype}, expected numbers of shape [n, 2] or [n, 3]: one "
-            "row per point, in metres, in the frame of the grippers."
-        )
-    # cameras report what they do not see as not finite, or as a number without meaning
-    finite = (np.abs(array) <= LIMITS["coordinate"].high).all(axis=1)
-    kept = array[finite, :2].astype(np.float32)
-    if len(kept) > capacity:
-        kept = kept[np.random.default_rng(0).choice(len(kept), capacity, replace=False)]
-    rows = np.zeros((capacity, 2), np.float32)
-    rows[: len(kept)] = kept
-    return PaddedCloud(rows, np.arange(capacity) < len(kept), int(np.sum(~finite)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +65,9 @@ class Tracker:
         after, seen = track(self.config, state, jnp.asarray(cloud.points, float), cloud.mask, jnp.asarray(pose, float))
         misfits = int(after.misfits)
         if misfits == 1 or (misfits > 0 and misfits % self.config.retry == 0):
-            return self._search(after, cloud, pose, otherwise=seen)
+            state, found = self._search(after, cloud, pose)
+            if int(found.status) == Status.TRACKED:
+                return state, found
         return after, seen
 
     def explain(
@@ -159,9 +117,7 @@ class Tracker:
             "grippers, and the length."
         )
 
-    def _search(
-        self, state: TrackState, cloud: PaddedCloud, pose: np.ndarray, otherwise: Track | None = None
-    ) -> tuple[TrackState, Track]:
+    def _search(self, state: TrackState, cloud: PaddedCloud, pose: np.ndarray) -> tuple[TrackState, Track]:
         """Looks for the cable without a prior; the state stays as it is if it is not found."""
         config = self.config
         count = int(cloud.mask.sum())
@@ -184,7 +140,5 @@ class Tracker:
         else:
             status, zero = jnp.asarray(Status.FEW_POINTS), jnp.asarray(0.0)
             found_by = (state.sigma, zero, zero, zero, zero)
-        if otherwise is not None:
-            return state, otherwise
         nowhere = jnp.full((config.registration.n_keypoints, 2), jnp.nan)
         return state, Track(nowhere, status, state.lost, *found_by)

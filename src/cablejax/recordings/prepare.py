@@ -93,27 +93,32 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
             "The grippers' poses are not given, and only one keypoint is on each: name the columns or topics of the "
             "poses, or two keypoints on each gripper."
         )
-    takes, repairs = _in_metres(takes, setup)
+    repairs: list[str] = []
+
+    def noted(result: tuple[tuple[Take, ...], list[str]]) -> tuple[Take, ...]:
+        """The takes of a step, whose sentences are noted."""
+        repairs.extend(result[1])
+        return result[0]
+
+    takes = noted(_in_metres(takes, setup))
     points = [take.keypoints for take in takes]
     if all(len(own) > 1 and np.array_equal(own[1:], own[:-1], equal_nan=True) for own in points):
         raise ValueError(
             "All samples have the same keypoints to the last digit, which no tracker measures: expected a recording of "
             "a cable that moves. Check which columns or topic are read, and that the tracker ran."
         )
-    takes, outliers = without_outliers(takes)
-    takes, flattened = tuple(into_frame(take, setup.frame) for take in takes), []
+    takes = tuple(into_frame(take, setup.frame) for take in noted(without_outliers(takes)))
     if not setup.hangs and takes[0].keypoints.shape[2] == 3:
-        takes, flattened = onto_table(takes)
-    takes, exchanged = restore_order(takes)
+        takes = noted(onto_table(takes))
+    takes = noted(restore_order(takes))
     _require_one_cable(takes, setup)
-    takes, held = without_held(takes)
-    takes, jumps = without_jumps(takes)
-    takes, stretched = without_stretched(takes)
+    for step in (without_held, without_jumps, without_stretched):
+        takes = noted(step(takes))
     if takes[0].keypoints.shape[2] == 3:
         require_hanging(takes, setup.frame)
     last = takes[0].keypoints.shape[1] - 1
     pairs = ((0, 1), (last - 1, last))
-    takes, cut = cut_at_gaps(takes, None if measured else (*pairs[0], *pairs[1]))
+    takes = noted(cut_at_gaps(takes, None if measured else (*pairs[0], *pairs[1])))
     if measured and takes[0].keypoints.shape[2] == 3:
         if setup.on_grippers == "pairs":
             require_rigid(takes, pairs)
@@ -122,7 +127,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
             require_readable(takes)
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
-    return takes, [*repairs, *outliers, *flattened, *exchanged, *held, *jumps, *stretched, *cut, *_jerks(takes)]
+    return takes, [*repairs, *_jerks(takes)]
 
 
 def _require_one_cable(takes: tuple[Take, ...], setup: Setup) -> None:
