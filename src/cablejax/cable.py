@@ -16,17 +16,6 @@ from cablejax.limits import LIMITS, check, shown
 GRAVITY = 9.81
 """Magnitude of gravity [m/s^2]."""
 
-NUMBERS = (
-    "length",
-    "diameter",
-    "linear_density",
-    "bending_stiffness",
-    "damping_time",
-    "rest_curvature",
-    "friction_coefficient",
-)
-"""Fields of a `Cable` that are single numbers; `cablejax.limits` has the limits of each."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Cable:
@@ -60,7 +49,9 @@ class Cable:
     grasp: tuple[str, str] = ("clamped", "clamped")
 
     def __post_init__(self):
-        check(self, *NUMBERS, n_keypoints="keypoints")
+        # each of these has a limit of its name
+        numbers = (field.name for field in dataclasses.fields(self) if isinstance(field.default, float))
+        check(self, *numbers, n_keypoints="keypoints")
         if self.diameter >= self.length:
             raise ValueError(
                 f"Cable.diameter is {self.diameter} m and its length {self.length} m: expected a cable that is longer "

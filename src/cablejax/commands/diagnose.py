@@ -65,10 +65,7 @@ class Diagnose(Command):
                 )
         read = [read_gap_log(path) for path in self.logs]
         log = read[0] if len(read) == 1 else joined(read, [str(path) for path in self.logs])
-        if log.in_space:
-            self._check_space()
-        else:
-            self._check_plane()
+        self._check_options(log)
         bounds = None if self.bounds is None else read_bounds(self.bounds)
         commissioning = [read_gap_log(path) for path in self.commissioning]
         settings = {
@@ -82,28 +79,26 @@ class Diagnose(Command):
             )
         return {**verdict_json(result), "report": str(page)}, f"{result.verdict}: {result.sentence}\n{page}"
 
-    def _check_plane(self) -> None:
-        """Rejects names of effects that a planar log is not searched for."""
+    def _check_options(self, log: GapLog) -> None:
+        """Rejects effects that such a log is not searched for, and options that do not apply to one in space."""
         from cablejax.diagnose import LIBRARY
         from cablejax.diagnose.actuation import ARMS
 
-        known = [effect.name for effect in LIBRARY]
+        known, where = [effect.name for effect in LIBRARY], "on a table"
+        if log.in_space:
+            from cablejax.spatial.effects import effect_names
+
+            known, where = effect_names(), "in space"
         for name in self.only:
-            if name in ARMS:
+            if name in ARMS and not log.in_space:
                 raise UsageError(f"--only names {name!r}, which is looked for in any case: leave it out.")
             if name not in known:
-                raise UsageError(f"--only names the effect {name!r}, expected some of {', '.join(known)}.")
-
-    def _check_space(self) -> None:
-        """Rejects options that do not apply to a log in space."""
-        from cablejax.spatial.effects import effect_names
-
-        for name in self.only:
-            if name not in effect_names():
                 raise UsageError(
-                    f"--only names the effect {name!r}, but {self.logs[0]} is a log in space, which is searched for "
-                    f"{', '.join(effect_names())}: name some of these."
+                    f"--only names the effect {name!r}, but {self.logs[0]} is a log {where}, which is searched for "
+                    f"{', '.join(known)}: name some of these."
                 )
+        if not log.in_space:
+            return
         if self.commissioning:
             raise UsageError(
                 f"--commissioning is given, but {self.logs[0]} is a log in space, where the gap is judged by "

@@ -30,7 +30,6 @@ EARLY = 0.02
 DRIFT = 1e-3
 """Rate at which the two clocks may drift apart; a delay that grows more slowly is not noticed."""
 
-
 _KIND = 16
 """Letters by which reasons of one kind agree."""
 _STILL = np.zeros((2, 3))
@@ -77,13 +76,13 @@ class RobotLink:
     def step(self, state: LinkState, now: float, observations: Sequence[Observation] = ()) -> tuple[LinkState, Reply]:
         """Processes observations and returns what the grippers must do.
 
+        If a controller rejects its input, the reply states the reason. The link waits for another first history; later,
+        the run stops.
+
         Args:
             state: from the last step.
             now: the link's clock [s]. Where it is set back, time goes on from where it was: a watchdog has to run out.
             observations: that have come since the last step, in the order in which they came.
-
-        If a controller rejects its input, the reply states the reason. The link waits for another first history; later,
-        the run stops.
         """
         settled, behind = state.commands == 0, max(state.behind, state.now - now)
         now = now + behind
@@ -181,9 +180,9 @@ class RobotLink:
             behind = (
                 f"The newest time stamp is {last.time - stamp:.3g} s before an earlier one: was the clock set back?"
             )
-            state = _told(state, behind)
+            state = _for_reason(state, behind)
         elif newer and state.status == Status.PAUSED and (old := offset - state.offset) > self.config.watchdog:
-            state = _told(state, f"Observations are {old:.3g} s old: do they arrive late, or was a clock set?")
+            state = _for_reason(state, f"Observations are {old:.3g} s old: do they arrive late, or was a clock set?")
         if newer and share >= self.config.min_seen and np.isfinite(pose).all():
             state = dataclasses.replace(state, newest=cleaned)
         elif state.newest is None:
@@ -271,7 +270,7 @@ class RobotLink:
         return self.controller.init(resting(self.controller, _complete(seen.keypoints), seen.gripper_pose))
 
 
-def _told(state: LinkState, reason: str) -> LinkState:
+def _for_reason(state: LinkState, reason: str) -> LinkState:
     """The state with this reason; one of the same kind, whose number alone changes, stays as it was first."""
     return state if state.reason[:_KIND] == reason[:_KIND] else dataclasses.replace(state, reason=reason)
 

@@ -36,15 +36,11 @@ class DatasetInfo:
     """Summary of a store.
 
     Attributes:
-        config: what was asked for.
-        versions: package versions that made it.
         n_complete: trajectories on disk in complete shards.
         attempts: motions drawn in vain, over all complete shards.
         digest: SHA-256 over all trajectories, or None until all are there. It does not depend on the shard size.
     """
 
-    config: DatasetConfig
-    versions: dict[str, str]
     n_complete: int
     attempts: int
     digest: str | None
@@ -52,7 +48,7 @@ class DatasetInfo:
     @property
     def complete(self) -> bool:
         """Whether every trajectory is there."""
-        return self.n_complete == self.config.n_trajectories
+        return self.digest is not None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,8 +167,6 @@ class Store:
         digest, attempts = self.digests()
         done = digest.any(axis=1)
         return DatasetInfo(
-            config=self.config,
-            versions=self.versions,
             n_complete=int(done.sum()),
             attempts=int(attempts[done].sum()),
             digest=hashlib.sha256(digest.tobytes()).hexdigest() if done.all() else None,

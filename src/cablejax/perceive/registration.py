@@ -96,8 +96,8 @@ class CurveFit(NamedTuple):
         gripper_pose: where its ends are, shape [Q, 3].
         keypoints: positions uniform in arc length [m], shape [N, 2].
         sigma: standard deviation of the points across the cable [m], shape [].
-        log_likelihood: of the cloud [nats], shape [].
-        log_posterior: the same less the cost of bending, to compare fits of one cloud, shape [].
+        log_posterior: log likelihood of the cloud less the cost of bending, to compare fits of one cloud [nats], shape
+            [].
         support: part of the cloud that lies within reach of the curve, shape [].
         seen: part of the cable that has points, shape [].
         curvature: the largest of the curve [1/m], shape [].
@@ -108,7 +108,6 @@ class CurveFit(NamedTuple):
     gripper_pose: Float[Array, "*b Q 3"]
     keypoints: Float[Array, "*b N 2"]
     sigma: Float[Array, "*b"]
-    log_likelihood: Float[Array, "*b"]
     log_posterior: Float[Array, "*b"]
     support: Float[Array, "*b"]
     seen: Float[Array, "*b"]
@@ -257,7 +256,6 @@ def _assess(config: RegistrationConfig, points, mask, angles, pose, sigma, reach
         gripper_pose=pose,
         keypoints=keypoints_of(config.matrices, shape),
         sigma=sigma,
-        log_likelihood=moments.log_likelihood,
         log_posterior=moments.log_likelihood - bending,
         support=jnp.sum(near) / count,
         seen=jnp.mean(moments.weight > jnp.maximum(0.1 * share, 1.0)),

@@ -69,7 +69,7 @@ def store_sheet(store: Store, name: str) -> Sheet:
             **cable_facts(config.cable),
             "motions drawn and rejected": f"{info.attempts}",
             "digest": info.digest or "none until all trajectories are complete",
-            "versions": ", ".join(f"{package} {version}" for package, version in info.versions.items()),
+            "versions": ", ".join(f"{package} {version}" for package, version in store.versions.items()),
         },
     )
 
