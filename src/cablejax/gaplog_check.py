@@ -89,14 +89,14 @@ def _validate_arrays(log: GapLog) -> None:
             raise ValueError(f"Field 'time' does not increase, or is not finite, in episode {index}.")
         _check_clock(time, f"of episode {index}")
         # the last command is held for no sample
-        for name, end in (("gripper_pose", length), ("gripper_command", length - 1)):
-            if not np.isfinite(getattr(log, name)[index, :end]).all():
+        for name, limit, end in (("gripper_pose", "coordinate", length), ("gripper_command", "speed", length - 1)):
+            values = getattr(log, name)[index, :end]
+            if not np.isfinite(values).all():
                 raise ValueError(f"Field '{name}' is not finite in episode {index}; only keypoints may be NaN.")
+            largest = float(np.abs(values).max(initial=0.0))
+            require(largest, limit, f"The largest entry of field '{name}' in episode {index}")
         if np.isinf(log.keypoints[index, :length]).any():
             raise ValueError(f"Field 'keypoints' is infinite in episode {index}; a keypoint not observed is NaN.")
-        for name, limit, end in (("gripper_pose", "coordinate", length), ("gripper_command", "speed", length - 1)):
-            largest = float(np.abs(getattr(log, name)[index, :end]).max(initial=0.0))
-            require(largest, limit, f"The largest entry of field '{name}' in episode {index}")
         if dimension == 3:
             norm = np.linalg.norm(log.gripper_pose[index, :length, :, 3:], axis=-1)
             if np.abs(norm - 1).max() > 1e-3:

@@ -248,13 +248,9 @@ def _median_angle(difference: Float[np.ndarray, " S"]) -> float:
 
 def _tangents(log: GapLog, gripper: int) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " S"]]:
     """A gripper's angle, and the direction of the cable next to it [rad], in all samples that show it."""
-    angles, directions = [], []
-    for episode, samples in enumerate(log.episode_length):
-        ends = log.keypoints[episode, :samples, :2] if gripper == 0 else log.keypoints[episode, :samples, -2:]
-        along = np.diff(ends.astype(float), axis=1)[:, 0]
-        angles.append(log.gripper_pose[episode, :samples, gripper, 2].astype(float))
-        directions.append(np.arctan2(along[:, 1], along[:, 0]))
-    angle, direction = np.concatenate(angles), np.concatenate(directions)
+    ends = log.keypoints[log.valid][:, :2] if gripper == 0 else log.keypoints[log.valid][:, -2:]
+    along = np.diff(ends.astype(float), axis=1)[:, 0]
+    angle, direction = log.gripper_pose[log.valid][:, gripper, 2].astype(float), np.arctan2(along[:, 1], along[:, 0])
     seen = np.isfinite(direction)
     return angle[seen], direction[seen]
 

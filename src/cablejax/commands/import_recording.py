@@ -43,8 +43,8 @@ class _Import(Command, abc.ABC):
             raise UsageError(f"--out is {self.out}, expected a file name that ends in .npz.")
         output_file(self.out, overwrite=self.overwrite)
         log, repairs = self.imported()
-        result = _summary(write_gap_log(self.out, log, overwrite=self.overwrite), log, repairs)
-        return {"logs": [result]}, _as_text(result)
+        write_gap_log(self.out, log, overwrite=self.overwrite)
+        return _described(self.out, log, repairs)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -138,29 +138,25 @@ class Import:
     )
 
 
-def _summary(path: pathlib.Path, log: GapLog, repairs: Sequence[str]) -> dict[str, Any]:
+def _described(path: pathlib.Path, log: GapLog, repairs: Sequence[str]) -> tuple[dict[str, Any], str]:
+    """What was imported and repaired, as the command's result and in words."""
     import numpy as np
 
-    samples = log.episode_length
-    seen = [np.isfinite(points[:n]).all(axis=-1).mean() for points, n in zip(log.keypoints, samples, strict=True)]
-    return {
+    points, length = log.keypoints[log.valid], float(log.meta["cable"]["length_m"])
+    seen = float(np.isfinite(points).all(axis=-1).mean())
+    result = {
         "log": str(path),
-        "episodes": len(samples),
-        "samples": int(samples.sum()),
-        "keypoints": int(log.keypoints.shape[2]),
-        "dimension": int(log.keypoints.shape[3]),
-        "length_m": float(log.meta["cable"]["length_m"]),
-        "observed": float(np.average(seen, weights=samples)),
+        "episodes": len(log.keypoints),
+        "samples": len(points),
+        "keypoints": points.shape[1],
+        "dimension": points.shape[2],
+        "length_m": length,
+        "observed": seen,
         "repairs": list(repairs),
     }
-
-
-def _as_text(result: dict[str, Any]) -> str:
-    lines = [
-        f"{result['log']}: {counted(result['episodes'], 'episode')}, {counted(result['samples'], 'sample')} of "
-        f"{result['keypoints']} "
-        f"keypoints in {'space' if result['dimension'] == 3 else 'the plane'}, {100 * result['observed']:.4g} % of "
-        f"them observed; the cable is {result['length_m']:.4g} m long.",
-        *result["repairs"],
-    ]
-    return "\n".join(lines if result["repairs"] else [*lines, "Nothing had to be repaired."])
+    line = (
+        f"{path}: {counted(len(log.keypoints), 'episode')}, {counted(len(points), 'sample')} of {points.shape[1]} "
+        f"keypoints in {'space' if log.in_space else 'the plane'}, {100 * seen:.4g} % of them observed; the cable is "
+        f"{length:.4g} m long."
+    )
+    return {"logs": [result]}, "\n".join([line, *(repairs or ["Nothing had to be repaired."])])

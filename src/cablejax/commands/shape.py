@@ -148,6 +148,6 @@ class Shape(Command):
             for old in ("report.html", "summary.json", "demo.gif"):  # of another run, whose log goes
                 (self.out / old).unlink(missing_ok=True)
             written = write_gap_log(self.out / "log.npz", log, overwrite=True)
-        seconds = float(sum(log.time[e, n - 1] for e, n in enumerate(log.episode_length)))
+        seconds = float(log.intervals.sum())
         result = {"log": str(written), "episodes": len(log.episode_length), "seconds": seconds}
         return result, f"{written}\n\nDiagnose it with `cablejax diagnose {shlex.quote(str(written))}`."

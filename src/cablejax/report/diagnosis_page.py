@@ -155,10 +155,9 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
 def _lead(diagnosis: CableDiagnosis) -> str:
     """The log and its gap in one line."""
     log, gap = diagnosis.log, diagnosis.gap
-    seconds = sum(float(t[n - 1] - t[0]) for t, n in zip(log.time, log.episode_length, strict=True))
     return (
-        f"{counted(len(log.episode_length), 'episode')}, {seconds:.0f} s, {log.keypoints.shape[2]} keypoints. "
-        f"The simulator misses the recorded cable by {millimetres(gap.before_rmse_mm)}; the recording's own "
+        f"{counted(len(log.episode_length), 'episode')}, {log.intervals.sum():.0f} s, {log.keypoints.shape[2]} "
+        f"keypoints. The simulator misses the recorded cable by {millimetres(gap.before_rmse_mm)}; the recording's own "
         f"{_noise(diagnosis)}."
     )
 

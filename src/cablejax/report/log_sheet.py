@@ -32,9 +32,8 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
     """What a gap log holds; `exported` is the format of one that has to be imported first, as the command has it."""
     episodes, targets, planar = episodes_of(log), targets_of(log), not log.in_space
     cable = dataclasses.replace(config_of_log(log).cable, diameter=log.meta["cable"]["diameter_m"])
-    seconds = sum(float(episode.time[-1] - episode.time[0]) for episode in episodes)
-    seen = np.concatenate([np.isfinite(episode.keypoints).all(axis=-1) for episode in episodes])
-    points, steps = np.concatenate([episode.keypoints for episode in episodes]), log.intervals
+    points, steps = log.keypoints[log.valid], log.intervals
+    seen = np.isfinite(points).all(axis=-1)
     noise, how = _noise(log)
     file = shlex.quote(name)
     # a few episodes, evenly over the log
@@ -46,7 +45,7 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
     return Sheet(
         kind="gap log",
         title=f"{counted(len(episodes), 'episode')} of a cable of {cable.length:g} m "
-        f"{'on a table' if planar else 'in space'}, {seconds:.0f} s in all",
+        f"{'on a table' if planar else 'in space'}, {steps.sum():.0f} s in all",
         lead=f"{name}: {log.meta['source']}",
         cards=[
             ("Samples", f"{len(seen)}", f"{1 / np.median(steps):.4g} per second" if len(steps) else "one per episode"),

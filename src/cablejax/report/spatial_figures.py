@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import matplotlib
@@ -27,11 +26,8 @@ def with_the_cause(diagnosis: CableDiagnosis) -> np.ndarray | None:
 
 def recording_ends(diagnosis: CableDiagnosis, episodes: np.ndarray) -> np.ndarray:
     """Of some episodes in order, the places of those that begin another recording than the one before."""
-    of = diagnosis.log.meta.get("recording")
-    if not isinstance(of, list) or len(of) != len(diagnosis.log.episode_length):
-        return np.zeros(0, int)
-    names = [str(of[e]) for e in episodes]
-    return 1 + np.flatnonzero([one != other for one, other in itertools.pairwise(names)])
+    names = np.array(labels(diagnosis.log, "recording", default=""))[episodes]
+    return 1 + np.flatnonzero(names[1:] != names[:-1])
 
 
 def files_figure(diagnosis: CableDiagnosis) -> Figure:
