@@ -48,6 +48,31 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     if len(names) != len(logs):
         raise GapLogError(f"There are {len(names)} names, expected one for each of the {len(logs)} gap logs.")
     logs = _of_one_length(logs)
+    _require_each_once(logs, names)
+    _require_one_set_up(logs, names)
+    derived = np.concatenate([commands_derived(log) for log in logs])
+    # what one of them guessed of the cable that they share is a guess
+    guessed = list(dict.fromkeys(name for log in logs for name in _guessed(log)))
+    own_words = {*META_FIELDS, *EPISODE_LABELS, COMMANDS_DERIVED, TARGETS, "guessed", "recordings"}
+    targets = [None if target is None else target.tolist() for log in logs for target in targets_of(log)]
+    extra = set.intersection(*(set(log.meta) for log in logs)) - own_words
+    shared = [name for name in sorted(extra) if all(log.meta[name] == logs[0].meta[name] for log in logs)]
+    meta = {
+        **{name: logs[0].meta[name] for name in (*META_FIELDS, *shared)},
+        **{name: values for name in EPISODE_LABELS if (values := _labels(logs, names, name)) is not None},
+        **({COMMANDS_DERIVED: True if derived.all() else derived.tolist()} if derived.any() else {}),
+        **({"guessed": guessed} if guessed else {}),
+        **({TARGETS: targets} if any(target is not None for target in targets) else {}),
+        "motion": [motion for log in logs for motion in log.meta["motion"]],
+        "source": "; ".join(dict.fromkeys(log.meta["source"] for log in logs)),
+        "recordings": [part for log, name in zip(logs, names, strict=True) for part in recordings(log, name)],
+    }
+    episodes = [episode for log in logs for episode in episodes_of(log)]
+    return stack_episodes(episodes, meta, holds=any(log.hold is not None for log in logs))
+
+
+def _require_each_once(logs: Sequence[GapLog], names: Sequence[str]) -> None:
+    """Raises GapLogError if two logs share an episode: it would count twice."""
     seen: list[tuple[Episode, str]] = []
     begun = np.zeros((0, _FIRST))
     for log, name in zip(logs, names, strict=True):
@@ -64,34 +89,20 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
                     )
         seen += [(one, name) for one in own]
         begun = np.concatenate([begun, first])
-        there_all, here_all = _set_up(logs[0]), _set_up(log)
-        for field in there_all | here_all:
-            here, there = here_all.get(field), there_all.get(field)
+
+
+def _require_one_set_up(logs: Sequence[GapLog], names: Sequence[str]) -> None:
+    """Raises GapLogError if logs differ in what recordings of one set-up have in common."""
+    stated = _set_up(logs[0])
+    for log, name in zip(logs, names, strict=True):
+        own = _set_up(log)
+        for field in stated | own:
+            here, there = own.get(field), stated.get(field)
             if not _same(here, there):
                 raise GapLogError(
                     f"{name} is not of the set-up of {names[0]}: '{field}' is {shown(here)} instead of {shown(there)}. "
                     "Diagnose them separately, or correct the log that states it wrongly."
                 )
-    derived = np.concatenate([commands_derived(log) for log in logs])
-    # what one of them guessed of the cable that they share is a guess
-    guessed = list(dict.fromkeys(name for log in logs for name in _guessed(log)))
-    own_words = {*META_FIELDS, *EPISODE_LABELS, COMMANDS_DERIVED, TARGETS, "guessed", "recordings"}
-    targets = [None if target is None else target.tolist() for log in logs for target in targets_of(log)]
-    extra = set.intersection(*(set(log.meta) for log in logs)) - own_words
-    alike = (name for name in sorted(extra) if all(log.meta[name] == logs[0].meta[name] for log in logs))
-    shared = [*META_FIELDS, *alike]
-    meta = {
-        **{name: logs[0].meta[name] for name in shared},
-        **{name: values for name in EPISODE_LABELS if (values := _labels(logs, names, name)) is not None},
-        **({COMMANDS_DERIVED: True if derived.all() else derived.tolist()} if derived.any() else {}),
-        **({"guessed": guessed} if guessed else {}),
-        **({TARGETS: targets} if any(target is not None for target in targets) else {}),
-        "motion": [motion for log in logs for motion in log.meta["motion"]],
-        "source": "; ".join(dict.fromkeys(log.meta["source"] for log in logs)),
-        "recordings": [part for log, name in zip(logs, names, strict=True) for part in recordings(log, name)],
-    }
-    episodes = [episode for log in logs for episode in episodes_of(log)]
-    return stack_episodes(episodes, meta, holds=any(log.hold is not None for log in logs))
 
 
 def commands_derived(log: GapLog) -> Bool[np.ndarray, "E"]:

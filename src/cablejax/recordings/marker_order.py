@@ -71,17 +71,16 @@ def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
         )
     restored, repairs = [], []
     for take in takes:
-        turned = _reversed(take, usual)
-        tracked = _tracked(take.keypoints[:, ::-1] if turned else take.keypoints, usual)
-        changed = (tracked != np.arange(len(usual) + 1)).any(axis=1)
-        if turned:
+        if _reversed(take, usual):
             repairs.append(f"Take {take.name}: its keypoints ran from gripper 1 to gripper 0 and were reversed.")
             take = dataclasses.replace(take, keypoints=take.keypoints[:, ::-1])
-        if changed.any():
-            markers = np.flatnonzero((tracked != np.arange(len(usual) + 1)).any(axis=0)).tolist()
+        tracked = _tracked(take.keypoints, usual)
+        moved = tracked != np.arange(len(usual) + 1)
+        if moved.any():
+            markers, samples = (np.flatnonzero(moved.any(axis=axis)).tolist() for axis in (0, 1))
             repairs.append(
                 f"Take {take.name}: keypoints {', '.join(map(str, markers))} had exchanged their names in "
-                f"{changed.sum()} of {len(changed)} samples, from sample {int(np.argmax(changed))}, and were reordered."
+                f"{len(samples)} of {len(moved)} samples, from sample {samples[0]}, and were reordered."
             )
             points = np.take_along_axis(take.keypoints, tracked[:, :, None], axis=1)
             take = dataclasses.replace(take, keypoints=points)
