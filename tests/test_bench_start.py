@@ -41,7 +41,7 @@ def test_the_second_run_finds_what_the_first_kept(tmp_path, monkeypatch):
     ("words", "message"),
     [
         (["--parts"], "expected some of import, help, control, verdict"),
-        (["--horizon", "-1"], "--horizon -1"),
+        (["--horizon", "-1"], "--horizon is -1"),
         (["--repeats", "0"], "--repeats is 0"),
         (["none.npz"], "none.npz"),
         (["--parts", "control", "--weights", "nowhere"], "nowhere"),

@@ -18,6 +18,7 @@ import tyro
 
 from cablejax.commands.options import Command, UsageError, require_counts, say, text_table
 from cablejax.compiled_programs import FOLDER, keep_compiled_programs
+from cablejax.limits import require
 
 Part = Literal["import", "help", "control", "verdict"]
 """What is timed."""
@@ -54,11 +55,9 @@ class BenchStart(Command):
         from cablejax.gaplog import read_gap_log
 
         require_counts(self, "repeats")
-        if not self.parts or self.horizon < 0:
-            raise UsageError(
-                f"--parts {self.parts}, --horizon {self.horizon}: expected some of {', '.join(get_args(Part))}, and a "
-                "horizon of at least 0."
-            )
+        require(self.horizon, "count_from_zero", "--horizon")
+        if not self.parts:
+            raise UsageError(f"--parts is empty, expected some of {', '.join(get_args(Part))}.")
         for log in self.logs:
             read_gap_log(log)  # what cannot be read is said before anything is timed
         result: dict[str, Any] = {}

@@ -33,7 +33,7 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
     episodes, targets, planar = episodes_of(log), targets_of(log), not log.in_space
     cable = dataclasses.replace(config_of_log(log).cable, diameter=log.meta["cable"]["diameter_m"])
     points, steps = log.keypoints[log.valid], log.intervals
-    seen = np.isfinite(points).all(axis=-1)
+    seen = np.asarray(np.isfinite(points).all(axis=-1))
     noise, how = _noise(log)
     file = shlex.quote(name)
     # a few episodes, evenly over the log
