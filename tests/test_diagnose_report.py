@@ -25,7 +25,7 @@ from cablejax.gaplog import write_gap_log
 from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import where_figure, worst_moment
 from cablejax.report.diagnosis_page import write_diagnosis_page
-from cablejax.report.diagnosis_sections import ranking_note
+from cablejax.report.diagnosis_sections import detail_tables, ranking_note
 from cablejax.report.effect_words import effect_place, instruction, quantity, share
 from cablejax.report.motion_figures import motion_figure
 from cablejax.report.spatial_figures import recording_ends
@@ -417,6 +417,16 @@ def test_in_space_the_page_describes_the_search_the_noise_and_the_units(space):
     assert "It is largest in file" in page and "of 4 only" not in page
     assert verdict["where"]["along_cable_mm"][4] == pytest.approx(30, rel=0.1)
     assert [row["horizon_s"] for row in verdict["where"]["per_horizon_mm"]] == [1.0, 2.0]
+
+
+def test_what_was_not_computed_of_an_effect_is_said_in_the_chart_and_in_the_table():
+    result = diagnosis()
+    assert not np.isfinite(result.ranking[-1].held_out_shrinkage)
+    figure = ranking_figure(result)
+    assert figure is not None and [text.get_text() for text in figure.axes[1].texts] == ["97 %", "70 %", "n/a"]
+    assert all(np.isfinite(text.get_position()).all() for ax in figure.axes for text in ax.texts)
+    head, rows = next((head, rows) for title, head, rows in detail_tables(result) if title.startswith("All effects"))
+    assert dict(zip(head, rows[-1], strict=True))["share removed"] == "n/a"
 
 
 def test_the_worst_moment_is_a_sample_of_a_log_shorter_than_the_smoothing():

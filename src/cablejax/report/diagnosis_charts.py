@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis
 from cablejax.diagnose.judgement import effect_title, share
-from cablejax.report.effect_words import explained_label, millimetres, short
+from cablejax.report.effect_words import explained_label, millimetres, share_removed, short
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, draw_bars
 
 _MAX_RANKED = 8
@@ -47,14 +47,14 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
     labels = [f"{effect_title(r.name)}{f', {r.outcome}' if r.outcome else ''}"[:_LABEL] for r in ranked]
     # were there no other causes than those of the library
     chance = "probability" if diagnosis.effects else "probability, if the cause is in the library"
-    panels = [([r.held_out_shrinkage for r in ranked], "share of the gap that it removes")]
+    panels = [("share of the gap that it removes", [(r.held_out_shrinkage, share_removed(r)) for r in ranked])]
     if likely:
-        panels.insert(0, ([r.probability or 0.0 for r in ranked], chance))
+        panels.insert(0, (chance, [(r.probability or 0.0, share(r.probability or 0.0)) for r in ranked]))
     with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.0, 0.9 + 0.36 * max(len(ranked), 3)), layout="constrained")
         axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-        for ax, (values, title) in zip(axes, panels, strict=True):
-            draw_bars(ax, labels, values, list(map(share, values)), colours, 1.0)
+        for ax, (title, bars) in zip(axes, panels, strict=True):
+            draw_bars(ax, labels, [value for value, _ in bars], [word for _, word in bars], colours, 1.0)
             ax.set_title(title)
     return figure
 

@@ -18,6 +18,7 @@ from cablejax.report.effect_words import (
     millimetres,
     parameter_title,
     quantity,
+    share_removed,
 )
 
 # More episodes than this are counted, not listed.
@@ -214,7 +215,7 @@ def detail_tables(diagnosis: CableDiagnosis) -> list[Table]:
             EFFECTS.get(r.name, ""),
             *([share(r.probability)] if alone and r.probability is not None else []),
             *([] if alone else [r.outcome or ""]),
-            share(r.held_out_shrinkage),
+            share_removed(r),
             millimetres(r.leftover_mm),
         )
         for r in diagnosis.ranking

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, NextMotion
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, NextMotion, Ranked
 from cablejax.diagnose.judgement import effect_title, listed, share
 
 _DECIMALS = 6
@@ -131,8 +131,8 @@ def quantity(value: Any, unit: str, ci90: Any = None, *, interval: bool = True) 
 
 
 def millimetres(value: float) -> str:
-    """A length in millimetres as `short` writes it: "0.04 mm", "1.3 mm", "27 mm"."""
-    return f"{short(value)} mm"
+    """A length in millimetres as `short` writes it: "0.04 mm", "1.3 mm", "27 mm"; "n/a" where it is not known."""
+    return f"{short(value)} mm" if math.isfinite(value) else "n/a"
 
 
 def error_falls(gap: Gap) -> str:
@@ -180,6 +180,11 @@ def _digits(numbers: Sequence[float]) -> int:
     size = 0.25 * abs(numbers[-1] - numbers[1]) if len(numbers) > 2 else 0.0
     size = size or 0.01 * abs(numbers[0])
     return max(math.ceil(-math.log10(size)), 0) if size > 0 else 1
+
+
+def share_removed(ranked: Ranked) -> str:
+    """The share of the gap that an effect removes; "n/a" where it was not computed."""
+    return share(ranked.held_out_shrinkage) if math.isfinite(ranked.held_out_shrinkage) else "n/a"
 
 
 def explained_label(diagnosis: CableDiagnosis) -> str:

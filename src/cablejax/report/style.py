@@ -222,12 +222,12 @@ def draw_bars(
     Args:
         ax: empty axes.
         names: of the bars.
-        values: their lengths; a negative one has no bar.
+        values: their lengths; one that is negative or NaN has no bar.
         words: at their ends.
         colours: one, or one for each.
         longest: the value at which a bar reaches almost across the axes.
     """
-    lengths = np.maximum(values, 0.0)
+    lengths = np.fmax(values, 0.0)
     ax.barh(range(len(names)), lengths, color=colours, height=0.62)
     for row, (length, word) in enumerate(zip(lengths, words, strict=True)):
         ax.text(length + 0.015 * longest, row, word, va="center", fontsize=10)
