@@ -92,8 +92,9 @@ def test_bad_starts_are_refused(plant):
 
 def test_an_unstable_simulation_is_reported(plant):
     plant.reset(ARCH)
-    with pytest.raises(PlantError, match="unstable"):
+    with pytest.raises(PlantError, match="unstable") as refused:
         plant.step(np.array([[0, 1e12, 0], [0, 1e12, 0]], float))
+    assert isinstance(refused.value, ValueError), "commands report these"
     with pytest.raises(ValueError, match="reset"):
         plant.step(STILL)
     assert np.isfinite(plant.reset(ARCH).keypoints).all()

@@ -17,7 +17,6 @@ from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.dynamics.weights import FILE_NAME, save_weights
 from cablejax.npz import read_npz
 from cablejax.simulate.motions import MotionConfig, random_motion
-from cablejax.simulate.table_plant import PlantError
 from cablejax.types import Trajectory
 from closed_loop.protocols import GuessingCable
 
@@ -71,7 +70,7 @@ def record(
             seen = [plant.reset(start)]
             for command in twist:
                 seen += plant.record(command, 1.0, samples=1)
-        except (PlantError, ValueError) as error:
+        except ValueError as error:
             print(f"recording drawn again: {error}", file=sys.stderr)
             continue
         keypoints.append([one.keypoints for one in seen])

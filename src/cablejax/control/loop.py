@@ -14,7 +14,7 @@ from cablejax.control.run import ClosedLoopRun
 from cablejax.control.run_log import RunLog
 from cablejax.control.targets import Target
 from cablejax.limits import require
-from cablejax.simulate.table_plant import Observation, PlantError
+from cablejax.simulate.table_plant import Observation
 
 
 class ObservedCable(Protocol):
@@ -98,7 +98,7 @@ def run_closed_loop(
             break
         try:
             observations = plant.record(reply.twist, interval, samples=samples)
-        except (ValueError, PlantError) as error:
+        except ValueError as error:
             if not log.instants:
                 raise
             stopped = str(error)

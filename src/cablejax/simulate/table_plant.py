@@ -23,8 +23,8 @@ TAUT = 0.999
 """Largest distance between the grippers, in lengths of the cable, before a plant refuses to pull."""
 
 
-class PlantError(RuntimeError):
-    """The simulation of the plant became unstable."""
+class PlantError(ValueError):
+    """The simulation of the plant became unstable: a motion or effects that it cannot simulate."""
 
 
 @dataclasses.dataclass(frozen=True)
