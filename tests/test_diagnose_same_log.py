@@ -15,6 +15,7 @@ from cablejax.diagnose.belief import excess
 from cablejax.diagnose.case import Case, calibrated
 from cablejax.diagnose.fit import evaluate
 from cablejax.diagnose.recording import prepare
+from cablejax.gaplog_join import chosen
 from cablejax.types import GapLog
 from diagnose_cases import INTERVAL, SAMPLES, clean, log_of, record
 from staged import similar
@@ -195,6 +196,25 @@ def test_an_episode_of_a_few_samples_is_left_out():
     assert any("fewer than 20 samples: episode 1." in caveat for caveat in case.recording.caveats)
     with pytest.raises(DiagnosisError, match="longest episode has 7 samples"):
         Case.of(dataclasses.replace(log, episode_length=np.full_like(length, 7)))
+
+
+@pytest.mark.parametrize("fault", ["unseen", "short"])
+def test_an_episode_that_is_left_out_leaves_the_others_as_they_are(fault):
+    """It moves nothing, and is no motion against which others count as sensitive."""
+    log = record()
+    points, length = log.keypoints.copy(), log.episode_length.copy()
+    if fault == "unseen":
+        points[2:] = np.nan
+    else:
+        length[2:] = 7
+    facts = []
+    for one in (chosen(log, [0, 1]), dataclasses.replace(log, keypoints=points, episode_length=length)):
+        case = Case.of(one)
+        facts.append((case.growth(explanation()), case.stated_error()))
+    np.testing.assert_allclose(facts[1][0][:2], facts[0][0], rtol=0.01)
+    assert facts[1][1] == pytest.approx(facts[0][1], rel=0.01)
+    if fault == "unseen":
+        assert any("no keypoint was observed: episode 2, 3." in caveat for caveat in case.recording.caveats)
 
 
 def _at(time, even, values):

@@ -404,6 +404,12 @@ class TestJoined:
         with pytest.raises(GapLogError, match="There are 1 names, expected one for each of the 2 gap logs"):
             joined(logs, ["a.npz"])
 
+    def test_commands_without_a_recording_are_no_recording(self):
+        logs, names = self._halves()
+        unseen = dataclasses.replace(logs[1], keypoints=np.full_like(logs[1].keypoints, np.nan))
+        with pytest.raises(GapLogError, match=r"No keypoint is observed in b\.npz: .* give the recording"):
+            joined([logs[0], unseen], names)
+
     def test_what_was_joined_is_taken_apart(self):
         logs, names = self._halves()
         whole = joined(logs, names)

@@ -41,7 +41,8 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
         names: of each, for example that of its file; one that was joined itself keeps its parts' names.
 
     Raises:
-        GapLogError: recordings of different set-ups, or an episode twice; names both and what differs.
+        GapLogError: recordings of different set-ups, or an episode twice; names both and what differs. Or one without
+            any keypoint.
     """
     if not logs:
         raise GapLogError("Nothing to join: expected at least one gap log.")
@@ -77,6 +78,11 @@ def _require_each_once(logs: Sequence[GapLog], names: Sequence[str]) -> None:
     begun = np.zeros((0, _FIRST))
     for log, name in zip(logs, names, strict=True):
         own = [one for one in episodes_of(log) if np.isfinite(one.keypoints).any()]
+        if not own:
+            raise GapLogError(
+                f"No keypoint is observed in {name}: it shows no cable. If these are the commands of a motion, execute "
+                "them, and give the recording."
+            )
         first = np.array([_numbers(one)[:_FIRST] for one in own]).reshape(-1, _FIRST)
         for one, numbers in zip(own, first, strict=True):
             # the first few numbers decide nearly always

@@ -164,7 +164,7 @@ class Case:
                 by as many times more there, and by what stated numbers matter more than usual.
         """
         growth = self.growth(explanation()) if growth is None else growth
-        more = np.maximum(self._stated - np.median(self._stated), 0.0)
+        more = np.maximum(self._stated - self._usual(self._stated), 0.0)
         return weighed(
             self.simulator,
             self.recording.keypoints,
@@ -181,7 +181,7 @@ class Case:
         Both errors add up as squares; the median over episodes. Hardly anything for a cable of the usual stiffness, and
         millimetres for a soft rope, which buckles and is held by friction as it lies.
         """
-        return float(np.sqrt(np.median(self._stated)))
+        return float(np.sqrt(self._usual(self._stated)))
 
     @functools.cached_property
     def _stated(self) -> Float[np.ndarray, "E"]:
@@ -208,7 +208,7 @@ class Case:
                 dataclasses.replace(cable, rotation_offset=cable.rotation_offset + angles) for angles in askew
             )
         )
-        return np.maximum(moved / max(float(np.median(moved)), 1e-9), 1.0)
+        return np.maximum(moved / max(self._usual(moved), 1e-9), 1.0)
 
     def _moved_by(self, cables: Iterable[Physics]) -> Float[np.ndarray, "E"]:
         """Mean squares of each episode [m^2] by which changes of a cable move it, together.
@@ -232,12 +232,16 @@ class Case:
         again, _ = _steadied(pose + self.scatter * drawn, self.recording, self.arms)
         (after,) = dataclasses.replace(playback, gripper_pose=again.astype(np.float32)).keypoints([playback.believed])
         squares = self._squares((after - (self.nominal - self.simulator.correction)) ** 2)
-        return float(np.sqrt(np.median(squares)))
+        return float(np.sqrt(self._usual(squares)))
 
     def _squares(self, squares: Float[np.ndarray, "E T N 2"]) -> Float[np.ndarray, "E"]:
         """Mean square of each episode, where something was seen and nothing broke down."""
         known, axes = np.isfinite(self.recording.keypoints) & np.isfinite(squares), (1, 2, 3)
         return np.where(known, squares, 0.0).sum(axis=axes) / np.maximum(known.sum(axis=axes), 1)
+
+    def _usual(self, values: Float[np.ndarray, "E"]) -> float:
+        """Median over the episodes in which something was seen: any other has 0."""
+        return float(np.median(values[np.isfinite(self.recording.keypoints).any(axis=(1, 2, 3))]))
 
     @property
     def motion(self) -> Int[np.ndarray, "E"]:

@@ -109,6 +109,10 @@ def prepare(log: GapLog) -> Recording:
         )
     if short:
         caveats.append(f"Left out for having fewer than {_SHORTEST} samples: episode {', '.join(map(str, short))}.")
+    seen = [bool(np.isfinite(one.keypoints).any()) for one in episodes_of(log)]
+    if any(seen) and not all(seen):
+        unseen = ", ".join(str(e) for e in range(n_episodes) if not seen[e])
+        caveats.append(f"Left out because no keypoint was observed: episode {unseen}.")
     episodes, intervals = [], []
     derived = commands_derived(log)
     for e, recorded in enumerate(episodes_of(log)):
