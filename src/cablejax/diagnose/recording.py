@@ -107,12 +107,9 @@ def prepare(log: GapLog) -> Recording:
         raise DiagnosisError(
             f"The longest episode has {log.episode_length.max()} samples, expected one of at least {_SHORTEST}."
         )
-    if short:
-        caveats.append(f"Left out for having fewer than {_SHORTEST} samples: episode {', '.join(map(str, short))}.")
-    seen = [bool(np.isfinite(one.keypoints).any()) for one in episodes_of(log)]
-    if any(seen) and not all(seen):
-        unseen = ", ".join(str(e) for e in range(n_episodes) if not seen[e])
-        caveats.append(f"Left out because no keypoint was observed: episode {unseen}.")
+    unseen = [e for e, one in enumerate(episodes_of(log)) if not np.isfinite(one.keypoints).any()]
+    caveats += _left_out(short, f"for having fewer than {_SHORTEST} samples")
+    caveats += _left_out(unseen, "because no keypoint was observed")
     episodes, intervals = [], []
     derived = commands_derived(log)
     for e, recorded in enumerate(episodes_of(log)):
@@ -163,6 +160,10 @@ def prepare(log: GapLog) -> Recording:
         caveats.append("No holds are marked: the noise is assumed to be white, so a slow drift would count as a gap.")
     caveats += _without_commands(recording)
     return dataclasses.replace(recording, caveats=tuple(caveats))
+
+
+def _left_out(episodes: list[int], why: str) -> list[str]:
+    return [f"Left out {why}: episode {', '.join(map(str, episodes))}."] if episodes else []
 
 
 def _without_commands(recording: Recording) -> list[str]:
