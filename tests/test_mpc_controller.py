@@ -531,6 +531,9 @@ def test_millimetres_and_whole_targets_are_refused():
     millimetres = jax.tree.map(lambda x: 1000.0 * x, at_rest(START))
     with pytest.raises(ValueError, match=r"m apart, but the cable is .* expected poses and keypoints in metres"):
         controller().init(millimetres)
+    short = jax.tree.map(lambda x: 0.4 * x, at_rest(START))
+    with pytest.raises(ValueError, match=r"along its keypoints, but MPCConfig\.cable_length is 1 m: use "):
+        controller().init(short)
     whole = Target("own", np.asarray(hermite_shape(START, N)), np.asarray(START))
     with pytest.raises(ValueError, match=r"The target is a Target, expected an array of keypoints .*: its `keypoints`"):
         MPC(CONFIG, relaxing_cable, jnp.ones(()), whole)  # pyright: ignore[reportArgumentType]

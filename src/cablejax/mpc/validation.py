@@ -58,11 +58,17 @@ def check_history(target: Float[Array | np.ndarray, "N 2"], history: History) ->
 
 
 def check_reach(length: float, history: History) -> None:
-    """Raises ValueError if the grippers are much farther apart than a cable of this length [m] reaches."""
-    pose = history.gripper_pose
-    if isinstance(pose, Tracer):
+    """Raises ValueError if a cable of this length [m] does not reach to the grippers, or is far longer than seen."""
+    pose, points = history.gripper_pose, history.keypoints
+    if isinstance(pose, Tracer) or isinstance(points, Tracer):
         return
     apart = float(np.linalg.norm(np.asarray(pose[0, :2] - pose[1, :2])))
+    along = float(np.linalg.norm(np.diff(np.asarray(points[-1]), axis=0), axis=-1).sum())
+    if along * _FAR < length:
+        raise ValueError(
+            f"The cable measures {along:.3g} m along its keypoints, but MPCConfig.cable_length is {length:g} m: use "
+            "`MPCConfig.for_length`, and keypoints in metres."
+        )
     if apart > _FAR * length:
         raise ValueError(
             f"The grippers are {apart:.3g} m apart, but the cable is {length:g} m long (`MPCConfig.for_length`): "
