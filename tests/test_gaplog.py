@@ -238,11 +238,14 @@ def test_a_file_that_is_no_archive_or_damaged_is_refused(tmp_path, log):
     (tmp_path / "text.npz").write_text("not an archive")
     np.save(tmp_path / "array.npy", np.zeros(3))
     for name in ("text.npz", "array.npy"):
-        with pytest.raises(GapLogError, match=r"no \.npz archive"):
+        with pytest.raises(GapLogError, match=r"no \.npz archive\. Expected a gap log .* as `cablejax import` makes"):
             read_gap_log(tmp_path / name)
     with pytest.raises(FileNotFoundError, match="There is no file"):
         read_gap_log(tmp_path / "absent.npz")
     path = write_gap_log(tmp_path / "run.npz", log)
+    (tmp_path / "half.npz").write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(GapLogError, match=r"half\.npz is cut off: make it again\. Expected a gap log"):
+        read_gap_log(tmp_path / "half.npz")
     for broken in with_other_bytes(path.read_bytes(), 60):
         path.write_bytes(broken)
         with contextlib.suppress(GapLogError):

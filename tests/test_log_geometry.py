@@ -68,7 +68,9 @@ def test_an_angle_that_points_the_other_way_is_refused(heading, gripper):
 @pytest.mark.parametrize("heading", [0.0, 1.5, 3.1])
 def test_angles_in_degrees_are_refused(heading):
     log = log_of(*motion(heading))
-    with pytest.raises(GapLogError, match=r"in degrees .* expected radians. Multiply it by pi / 180"):
+    with pytest.raises(
+        GapLogError, match=r"in degrees .* expected radians. Multiply it by pi / 180 \(in a layout: `angle_unit"
+    ):
         validate(changed(log, "gripper_pose", lambda pose: pose[..., 2].__imul__(180 / np.pi)))
 
 

@@ -130,7 +130,11 @@ def test_a_take_ends_where_the_motion_has_another_name(tmp_path):
         ('time_unit = "ms"', 'time_unit = "min"', "time_unit is 'min'"),
         ("diameter_m = 0.006", "diameter_m = -1", "expected a number from 1e-06 to 1 m"),
         ("diameter_m = 0.006", "diameter_m = inf", "expected a number from 1e-06 to 1 m"),
-        ('time_unit = "ms"', "", "usual time between samples of episode 0 is 10.0, expected .* Is the time in seconds"),
+        (
+            'time_unit = "ms"',
+            "",
+            r"time between samples of episode 0 is 10\.0, expected .* \(in a layout: `time_unit`\)",
+        ),
         ("diameter_m = 0.006", f"diameter_m = 0.006\nkeypoint_arclength_m = {list(range(9))}", "gives it 8 m: correct"),
         ("diameter_m = 0.006", f"diameter_m = {10**50}", "diameter_m is an integer of 167 bits"),
         ("count = 9", "count = 100000000", "count is 100000000, expected a whole number from 2 to 1000"),

@@ -227,7 +227,9 @@ def read_gap_log(path: str | os.PathLike) -> GapLog:
     try:
         fields = read_npz(path, [*(name for name in DTYPES if name != "hold"), "meta"], ["hold"], text=["meta"])
     except NpzError as error:
-        raise GapLogError(f"{error} Expected a gap log ({SCHEMA}).") from error
+        raise GapLogError(
+            f"{error} Expected a gap log ({SCHEMA}), as `cablejax import` makes it of a recording."
+        ) from error
     try:
         meta = parse_json(str(fields["meta"]))
     except ValueError as error:

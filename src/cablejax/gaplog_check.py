@@ -108,7 +108,7 @@ def _check_clock(time: Float[np.ndarray, " T"], which: str) -> None:
     step = np.diff(time)
     if not len(step):
         return
-    usual, advice = round(float(np.median(step)), 9), "Is the time in seconds?"
+    usual, advice = round(float(np.median(step)), 9), "Is the time in seconds (in a layout: `time_unit`)?"
     begin = "Times are seconds from the episode's start: subtract the first of each episode."
     require(abs(float(time[0])), "duration", f"The first time {which}", begin)
     require(usual, "sample_interval", f"The usual time between samples {which}", advice)

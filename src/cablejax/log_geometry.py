@@ -33,6 +33,7 @@ _DEGREES_BETTER = 3.0
 _DEGREES_TURN = 10.0
 # A cable that turns so far [rad], so much with its gripper, shows its angle's unit.
 _TURNED, _WITH_IT = 0.35, 0.95
+_RADIANS = 'expected radians. Multiply it by pi / 180 (in a layout: `angle_unit = "deg"`).'
 
 
 def frozen(points: Float[np.ndarray, "T N D"]) -> Bool[np.ndarray, "T N"]:
@@ -192,7 +193,7 @@ def setup_fault(log: GapLog) -> str | None:
             )
         off = _median_angle(angle - direction)
         others = {
-            "in degrees: expected radians. Multiply it by pi / 180.": np.radians(angle) - direction,
+            f"in degrees: {_RADIANS}": np.radians(angle) - direction,
             "in units of 180 / pi rad: it was converted from degrees although it was in radians.": np.degrees(angle)
             - direction,
             "with the other sign: either y or the angle is mirrored. Negate the angle.": -angle - direction,
@@ -263,7 +264,7 @@ def _angle_fault(angle: Float[np.ndarray, " S"], direction: Float[np.ndarray, " 
     if turns_too_far and off > max(_DEGREES_OFF, _DEGREES_BETTER * in_degrees):
         return (
             f"up to {np.abs(angle).max():.3g}, which fits the cable next to it in degrees (median difference "
-            f"{in_degrees:.2g} rad) and not in radians ({off:.2g} rad): expected radians. Multiply it by pi / 180."
+            f"{in_degrees:.2g} rad) and not in radians ({off:.2g} rad): {_RADIANS}"
         )
     mirrored = _median_angle(angle + direction)
     if off > INWARDS and mirrored < _DEGREES_OFF:

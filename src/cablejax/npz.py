@@ -21,6 +21,8 @@ _UNREADABLE = (
     ValueError, TypeError, KeyError, OSError, EOFError, RuntimeError, MemoryError, OverflowError, SyntaxError,
     struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
 )  # fmt: skip
+_BEGIN = b"PK\x03\x04"
+"""First bytes of an archive."""
 
 
 class NpzError(ValueError):
@@ -49,7 +51,9 @@ def read_npz(
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}.")
     if not zipfile.is_zipfile(path):
-        raise NpzError(f"{path} is no .npz archive, or one that is cut off: make it again.")
+        with path.open("rb") as stream:
+            begun = stream.read(len(_BEGIN)) == _BEGIN
+        raise NpzError(f"{path} is {'cut off: make it again.' if begun else 'no .npz archive.'}")
     try:
         # NumPy leaves a file open that it opened itself and could not read
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
