@@ -272,6 +272,9 @@ def test_noise_and_the_error_of_the_rig_are_measured():
     smooth = np.stack([np.cos(np.linspace(0, 3, 200)), np.sin(np.linspace(0, 3, 200))], axis=1)
     assert tracing_noise(smooth + random.normal(scale=1e-3, size=(20, 200, 2))) == pytest.approx(1e-3, rel=0.03)
     assert rig_error(random.normal(scale=2e-3, size=(4000, 2))) == pytest.approx(2e-3, rel=0.03)
+    for wrong in (np.ones((1, 2)), np.ones(2), np.full((3, 2), np.nan)):
+        with pytest.raises(ValueError, match="of two photographs or more"):
+            rig_error(wrong)
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,10 @@ def _lines(connection: socket.socket) -> Iterator[list[bytes]]:
 
 def _message(line: bytes, simulated_clock: bool) -> Observation | float:
     """An observation, or the time; raises ValueError."""
-    content: Any = parse_json(line)
+    try:
+        content: Any = parse_json(line)
+    except ValueError as error:
+        raise ValueError(f"A message {error}") from error
     if simulated_clock and isinstance(content, dict) and set(content) == {"now"}:
         require(content["now"], "stamp", '"now"')
         return float(content["now"])

@@ -246,7 +246,15 @@ def rig_error(ends: Float[np.ndarray, "R 2"]) -> float:
 
     Args:
         ends: from the first clamp to the second, in every photograph of the rig [m]; the rig itself keeps this.
+
+    Raises:
+        ValueError: not at least two photographs, or not finite.
     """
+    if np.ndim(ends) != 2 or len(ends) < 2 or not np.isfinite(ends).all():
+        raise ValueError(
+            f"The ends have shape {np.shape(ends)}, expected finite ones of shape [R, 2] of two photographs or more: "
+            "state the error of one."
+        )
     return float(np.sqrt(ends.var(axis=0, ddof=1).mean()))
 
 
