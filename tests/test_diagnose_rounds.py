@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose import Calibration
+from cablejax.diagnose import rounds as diagnose_rounds
 from cablejax.diagnose.belief import log_scores
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate, improve
@@ -59,6 +60,14 @@ def test_nats_add_up_to_the_odds(alike):
         added = sum(one.nats[name] for one in rounds.rounds)
         leader = "bending_stiffness"
         assert added + cost == pytest.approx(np.log(last[name] / last[leader]), abs=1e-6)
+
+
+def test_the_only_explanation_left_is_compared_with_a_rejected_one(alike, monkeypatch):
+    """Else nothing would show which recording decided."""
+    monkeypatch.setattr(diagnose_rounds, "in_doubt", lambda fits, *_: (fits[:1], np.ones(1)))
+    rounds, _ = _rounds(_mixed(SOFT, SOFT))
+    assert list(rounds.rounds[0].nats) == ["bending_stiffness", "table_friction"]
+    assert rounds.rounds[1].nats == {name: alike[0].rounds[1].nats[name] for name in rounds.rounds[1].nats}
 
 
 def test_one_set_up_does_not_contradict_itself(alike):

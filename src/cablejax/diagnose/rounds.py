@@ -28,6 +28,8 @@ from cablejax.types import GapLog
 
 UNLIKELY = 1e-3
 """Recordings contradict one another where chance alone would make them differ as much less often than this."""
+_REJECTED = 2
+"""Explanations with which one is compared that alone is left."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +40,8 @@ class Round:
         name: of the recording.
         episodes: how many it has.
         nats: by which it speaks for each explanation that the whole leaves open against the most probable one; that one
-            has 0. With what is believed beforehand and as calibrated, they add up to the logarithm of the odds.
+            has 0. Where the whole leaves one alone, for the best of the rejected ones with as many effects. With what
+            is believed beforehand and as calibrated, they add up to the logarithm of the odds.
         probability: of these explanations after this recording and those before it, with the parameters that fit all.
         own_gain: nats that parameters of its own would gain for the most probable explanation by an effect.
     """
@@ -92,6 +95,10 @@ def rounds_of(
     if len(parts) < 2:
         return None
     kept, _ = in_doubt(fits, scores, evidence, calibration)
+    if len(kept) == 1:
+        effects = len(kept[0].explanation.terms)
+        rejected = [fit for fit in fits if fit is not kept[0] and len(fit.explanation.terms) == effects]
+        kept = [kept[0], *rejected[:_REJECTED]]
     names = [" + ".join(effect_names(fit.explanation)) or "nominal" for fit in kept]
     each = np.stack([evidence.log_likelihoods(fit.held_out_sse(evidence)) for fit in kept])
     score = {id(fit): value for fit, value in zip(fits, scores, strict=True)}
