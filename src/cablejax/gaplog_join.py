@@ -73,7 +73,7 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
 
 
 def _require_each_once(logs: Sequence[GapLog], names: Sequence[str]) -> None:
-    """Raises GapLogError if two logs share an episode: it would count twice."""
+    """Raises GapLogError if two logs share an episode, which would count twice, or one of them shows no keypoint."""
     seen: list[tuple[Episode, str]] = []
     begun = np.zeros((0, _FIRST))
     for log, name in zip(logs, names, strict=True):
