@@ -13,6 +13,7 @@ from cablejax.mpc import MPC, Action, LevenbergMarquardt, MPCConfig, ProjectedGr
 from cablejax.mpc.fallback import ABOUT, RETURNS, _followed, radius_after
 from cablejax.mpc.state import initial_state
 from cablejax.mpc.target_pose import straightened
+from cablejax.mpc.validation import check_reach
 from cablejax.residual.learner import LearnerConfig
 from cablejax.types import History, Measurement
 from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
@@ -534,6 +535,7 @@ def test_millimetres_and_whole_targets_are_refused():
     short = jax.tree.map(lambda x: 0.4 * x, at_rest(START))
     with pytest.raises(ValueError, match=r"along its keypoints, but MPCConfig\.cable_length is 1 m: use "):
         controller().init(short)
+    check_reach(1.0, dataclasses.replace(short, keypoints=short.keypoints[:, [0, N // 2, -1]]))
     whole = Target("own", np.asarray(hermite_shape(START, N)), np.asarray(START))
     with pytest.raises(ValueError, match=r"The target is a Target, expected an array of keypoints .*: its `keypoints`"):
         MPC(CONFIG, relaxing_cable, jnp.ones(()), whole)  # pyright: ignore[reportArgumentType]

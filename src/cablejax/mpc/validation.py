@@ -15,6 +15,8 @@ from cablejax.types import History, Measurement
 
 # Grippers may be farther apart than the cable is long by noise and by the offset of a tool, not by this factor.
 _FAR = 2.0
+# Between fewer keypoints a cable may be folded, and measure as little along them as a far shorter one.
+_FEWEST = 6
 
 
 def check_target(target: Float[Array | np.ndarray, "*batch N 2"]) -> None:
@@ -64,7 +66,7 @@ def check_reach(length: float, history: History) -> None:
         return
     apart = float(np.linalg.norm(np.asarray(pose[0, :2] - pose[1, :2])))
     along = float(np.linalg.norm(np.diff(np.asarray(points[-1]), axis=0), axis=-1).sum())
-    if along * _FAR < length:
+    if len(points[-1]) >= _FEWEST and along * _FAR < length:
         raise ValueError(
             f"The cable measures {along:.3g} m along its keypoints, but MPCConfig.cable_length is {length:g} m: use "
             "`MPCConfig.for_length`, and keypoints in metres."
