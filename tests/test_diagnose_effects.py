@@ -274,6 +274,15 @@ def test_a_tilt_is_given_as_it_was_reported(values):
     np.testing.assert_allclose(given.tilt, 9.81 * sine, atol=2e-3)
 
 
+@pytest.mark.parametrize("name", ["lumped_mass", "stiffness_profile", "intrinsic_curvature"])
+def test_a_place_that_is_not_given_is_the_middle_of_the_cable(name):
+    effect = EFFECTS[name]
+    *medians, last = effect.parameters
+    values, _ = effect.given({last.name: last.high}, Discretisation(Cable(length=0.4)))
+    assert values == (*(p.centre for p in medians), last.high)
+    assert effect.location(values, 0, Discretisation(Cable(length=0.4)))["along_cable_m"][0] <= 0.2
+
+
 def test_any_of_many_keypoints_may_be_off():
     config = Discretisation(Cable(n_keypoints=90))
     physics = parse_effect("keypoint_bias:index=80,offset_m=0.01").applied(nominal_physics(config), config)

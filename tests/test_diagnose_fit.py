@@ -94,20 +94,19 @@ def soft_and_dragged():
     facts = evidence(("bending_stiffness", (0.25,)), ("viscous_drag", (0.3,)), noise_mm=0.02)
     fits = improve(facts, evaluate(facts, [explanation(*parts((n, v))) for n, v in LOOK_ALIKES]), max_iterations=15)
     fits += evaluate(facts, [explanation()])
-    scores = log_scores(fits, facts, Calibration())
-    order = np.argsort(-scores)
-    return facts, fits, Search(tuple(fits[i] for i in order), scores[order], {})
+    return fits, Search.of(fits, facts, Calibration())
 
 
 def test_a_rival_that_leaves_as_little_is_a_look_alike():
     """However sure the likelihood is: in a wide gap it tells small differences between two laws from each other."""
-    facts, fits, found = soft_and_dragged()
-    ((_, rival),) = conclude(found, facts, Calibration(as_good=1e3)).equivalent
+    fits, found = soft_and_dragged()
+    ((_, rival),) = conclude(dataclasses.replace(found, calibration=Calibration(as_good=1e3))).equivalent
     assert rival == "table_friction"
-    strict = conclude(found, facts, Calibration(as_good=1.0))
+    strict = conclude(dataclasses.replace(found, calibration=Calibration(as_good=1.0)))
     assert strict.equivalent == () and strict.effects[0].probability > 0.99
     # draws of the posterior: each explanation as often as it is probable, none at all among them
-    posterior = conclude(Search(tuple(fits), np.array([0.0, -0.4, -0.8]), {}), facts, Calibration()).posterior
+    even = dataclasses.replace(found, fits=tuple(fits), scores=np.array([0.0, -0.4, -0.8]))
+    posterior = conclude(even).posterior
     counts = Counter(tuple(effect.name for effect in draw) for draw in posterior)
     assert [counts[names] for names in (("bending_stiffness",), ("table_friction",), ())] == [8, 5, 3]
     assert len({draw[0].parameters["ratio"] for draw in posterior[:8]}) == 8
@@ -144,10 +143,7 @@ def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     assert excess(wrong, facts) < calibration.as_good * excess(right, facts)
     assert not as_good(wrong, right, facts, calibration)
     assert as_good(right, right, facts, calibration)
-    scores = log_scores([right, wrong, null], facts, calibration)
-    order = np.argsort(-scores)
-    found = Search(tuple([right, wrong, null][i] for i in order), scores[order], {})
-    conclusion = conclude(found, facts, calibration)
+    conclusion = conclude(Search.of([right, wrong, null], facts, calibration))
     assert conclusion.verdict == "named+unknown" and conclusion.explained < calibration.telling
     # beside an unknown cause a name may only resemble it; where nobody has counted how often, it has no probability
     (effect,) = conclusion.effects
@@ -314,8 +310,8 @@ def test_every_start_of_the_library_lies_within_its_bounds():
 
 def test_the_headline_lists_no_cause_whose_probability_is_below_one_per_cent():
     """A likelihood may be sure against a look-alike that leaves as little: it is mentioned, not listed as a cause."""
-    facts, _, found = soft_and_dragged()
-    conclusion = conclude(found, facts, Calibration(as_good=1e3, adequate=1.0))
+    _, found = soft_and_dragged()
+    conclusion = conclude(dataclasses.replace(found, calibration=Calibration(as_good=1e3, adequate=1.0)))
     assert conclusion.verdict == "ambiguous" and conclusion.ranking[1].probability < 0.01
     words = sentence(conclusion, 0.9)
     assert words.startswith("The gap comes from bending stiffness.")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose import Calibration, explanation
-from cablejax.diagnose.belief import log_scores
 from cablejax.diagnose.conclude import Conclusion, conclude, sentence
 from cablejax.diagnose.diagnosis import ParameterEstimate
 from cablejax.diagnose.evidence import Evidence
@@ -38,12 +37,9 @@ def concluded(facts: Evidence, *, laws: bool = True) -> tuple[Conclusion, tuple[
     # a simulator that is exact but for its law, so that small gaps count
     calibration = Calibration(baseline=2e-5, noise_share=0.02)
     starts = [explanation(), explanation(*parts(FRICTION)), explanation(*parts(("bending_stiffness", (0.5,))))]
-    fits = improve(facts, evaluate(facts, starts), max_iterations=10)
-    scores = log_scores(fits, facts, calibration)
-    order = np.argsort(-scores)
-    found = Search(tuple(fits[i] for i in order), scores[order], {})
-    others = by_other_laws(found, facts, calibration) if laws else ()
-    return conclude(found, facts, calibration, others), others
+    found = Search.of(improve(facts, evaluate(facts, starts), max_iterations=10), facts, calibration)
+    others = by_other_laws(found) if laws else ()
+    return conclude(found, others), others
 
 
 @pytest.mark.parametrize("carried", [False, True])

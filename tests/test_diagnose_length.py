@@ -30,30 +30,31 @@ def stated(log: GapLog, ratio: float) -> GapLog:
 @pytest.mark.parametrize("ratio", [0.99, 1.01])
 def test_keypoints_show_the_length(ratio):
     log = stated(record(), ratio)
-    length = other_length(Case.of(log), log)
+    length = other_length(Case.of(log))
     assert length.stated == ratio
     assert length.measured == pytest.approx(1.0, abs=1e-3)
-    back = length.log
+    assert length.case is not None
+    back = length.case.log
     assert back.meta["cable"]["length_m"] == length.measured
     np.testing.assert_allclose(back.meta["keypoint_arclength_m"], np.linspace(0, length.measured, 13))
 
 
 def test_a_right_length_is_not_doubted():
     log = record()
-    assert other_length(Case.of(log), log) is None
+    assert other_length(Case.of(log)) is None
 
 
 def test_a_crumpled_nominal_cable_says_nothing_of_the_length():
     log = record()
     case = Case.of(log)
-    assert other_length(dataclasses.replace(case, nominal=0.4 * case.nominal), log) is None
+    assert other_length(dataclasses.replace(case, nominal=0.4 * case.nominal)) is None
 
 
 @pytest.mark.slow
 def test_caveat_on_keypoints_that_do_not_fit_the_length():
     log = stated(record(), 1.01)
     case = Case.of(log)
-    length = other_length(case, log)
+    length = other_length(case)
     (text,) = caveats_of(case, Calibration(), length, 0.0, commissioned=True)
     assert re.match(r"Keypoints are 1\.0 % closer together than the stated arc lengths, in every episode", text)
     assert length.assumes in with_readings(case, [length]).simulator.other_laws

@@ -197,6 +197,13 @@ def test_two_variants_of_one_effect_act_together():
     assert verdict_json(result)["gap"]["before_rmse_mm"] > 10 and result.leftover_p == 1.0
 
 
+def test_a_simulator_that_is_exact_has_no_gap():
+    """As one who tries it on the simulator's own prediction finds: all of an error of 0 is noise."""
+    result = diagnose_line(Line(X).predict([explanation()], np.arange(len(X)))[0])
+    assert result.verdict == "none" and result.gap.before_rmse_mm == 0.0
+    assert result.gap.split == {"noise": 1.0, "named": 0.0, "learnable": None, "unexplained": 0.0}
+
+
 def test_missing_observations_and_short_episodes_do_not_matter():
     missing = np.zeros((6, 200, 2), bool)
     missing[0, 120:], missing[1:3, 50:90, 1] = True, True

@@ -24,7 +24,7 @@ def held_log(*effects) -> GapLog:
 def test_a_log_whose_cable_begins_elsewhere_is_read_as_held_by_the_table():
     log = held_log()
     case = Case.of(log)
-    reading = held(case, log, Calibration())
+    reading = held(case, Calibration())
     assert isinstance(reading, Held) and reading.case is not None
     assert 0.003 < reading.off < 0.1
     # it begins where it was seen and stays there: the grippers rest in the first 17 samples
@@ -32,12 +32,12 @@ def test_a_log_whose_cable_begins_elsewhere_is_read_as_held_by_the_table():
     assert np.abs(start - seen.mean(axis=1, keepdims=True)).max() < 0.0012
     assert np.abs(settled - seen.mean(axis=1, keepdims=True)).max() > 0.002
     assert reading.assumes in with_readings(case, [reading]).simulator.other_laws
-    assert held(reading.case, log, Calibration()) is None
+    assert held(reading.case, Calibration()) is None
 
 
 def test_a_cable_that_has_settled_is_read_in_one_way():
     log = record()
-    assert held(Case.of(log), log, Calibration()) is None
+    assert held(Case.of(log), Calibration()) is None
 
 
 @pytest.mark.slow

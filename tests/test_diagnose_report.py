@@ -31,7 +31,7 @@ from cablejax.report.motion_figures import motion_figure
 from cablejax.report.spatial_figures import recording_ends
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
-from cablejax.spatial.gap import constant_offset, gap_of, in_log, noise_of, smallest_gap, where_of
+from cablejax.spatial.gap import constant_offset, gap_of, in_log, smallest_gap, where_of
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.windows import windows_of
 from diagnose_cases import arches, log_of, poses
@@ -336,7 +336,7 @@ def space(tmp_path_factory):
     log = dataclasses.replace(log, meta={**log.meta, "recording": ["a", "a", "b", "c"]})
     windows = windows_of(log)
     cable = SpatialCable(Rod(16, twisting=False), layout_of(windows, spatial_cases.NOMINAL), windows)
-    noise, along = noise_of(windows), np.sin(np.pi * np.linspace(0, 1, windows.keypoints.shape[2]))[:, None]
+    noise, along = windows.noise, np.sin(np.pi * np.linspace(0, 1, windows.keypoints.shape[2]))[:, None]
     before, after = (np.nan_to_num(windows.keypoints) + size * along for size in (0.03, 0.004))
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
     stiffness = ParameterEstimate(0.06, (0.05, 0.07), "m^4/s^2")

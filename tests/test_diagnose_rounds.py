@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose import Calibration
-from cablejax.diagnose import rounds as diagnose_rounds
-from cablejax.diagnose.belief import log_scores
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.rounds import Rounds, rounds_of
+from cablejax.diagnose.search import Search
 from diagnose_cases import clean, evidence_of, log_of, parts
 
 SOFT: tuple[Any, ...] = ("bending_stiffness", 0, (0.5,))
@@ -32,16 +31,14 @@ def _rounds(evidence: Evidence) -> tuple[Rounds, np.ndarray]:
     """The rounds of two recordings, and the scores of the explanations, best first."""
     starts = [explanation(*parts(one)) for one in (SOFT, RUBBED)]
     fits = improve(evidence, evaluate(evidence, [explanation(), *starts]), 12)
-    scores = log_scores(fits, evidence, CALIBRATION)
-    order = np.argsort(-scores)
+    found = Search.of(fits, evidence, CALIBRATION)
     log = log_of(np.nan_to_num(evidence.observed))
     log = dataclasses.replace(
         log, meta={**log.meta, "recordings": [{"name": "a", "episodes": 2}, {"name": "b", "episodes": 2}]}
     )
-    fits, scores = [fits[i] for i in order], scores[order]
-    rounds = rounds_of(log, fits, scores, evidence, CALIBRATION)
+    rounds = rounds_of(log, found)
     assert rounds is not None
-    return rounds, scores
+    return rounds, found.scores
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +61,7 @@ def test_nats_add_up_to_the_odds(alike):
 
 def test_the_only_explanation_left_is_compared_with_a_rejected_one(alike, monkeypatch):
     """Else nothing would show which recording decided."""
-    monkeypatch.setattr(diagnose_rounds, "in_doubt", lambda fits, *_: (fits[:1], np.ones(1)))
+    monkeypatch.setattr(Search, "in_doubt", lambda found: (found.fits[:1], np.ones(1)))
     rounds, _ = _rounds(_mixed(SOFT, SOFT))
     assert list(rounds.rounds[0].nats) == ["bending_stiffness", "table_friction"]
     assert rounds.rounds[1].nats == {name: alike[0].rounds[1].nats[name] for name in rounds.rounds[1].nats}
@@ -93,4 +90,5 @@ def test_an_effect_in_one_recording_only():
 
 def test_a_log_that_was_not_joined_has_no_rounds():
     log = log_of(clean(n_links=N_LINKS))
-    assert rounds_of(log, [], np.zeros(0), _mixed(SOFT, SOFT), CALIBRATION) is None
+    evidence = _mixed(SOFT, SOFT)
+    assert rounds_of(log, Search.of(evaluate(evidence, [explanation()]), evidence, CALIBRATION)) is None

@@ -22,12 +22,12 @@ from cablejax.simulate.rod import Rod
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock, thinned, with_poses_in_time
-from cablejax.spatial.diagnose import diagnose_space
-from cablejax.spatial.gap import OWN, noise_of, own_error, smallest_gap
+from cablejax.spatial.diagnose import _equivalent, _ranking, diagnose_space
+from cablejax.spatial.gap import OWN, in_log, own_error, smallest_gap, where_of
 from cablejax.spatial.geometry import local_changes
-from cablejax.spatial.identify import layout_of
+from cablejax.spatial.identify import TWISTED, Identified, _twisted, layout_of
 from cablejax.spatial.named import _shown
-from cablejax.spatial.search import falls, halves
+from cablejax.spatial.search import Step, falls, halves
 from cablejax.spatial.windows import windows_of
 
 
@@ -36,7 +36,7 @@ def test_windows_know_what_the_grippers_hold():
     assert windows.held == (2, 2)
     assert windows.keypoints.shape == (4, 100, 6, 3)
     np.testing.assert_allclose(windows.arclength, [*cases.MARKS, cases.LENGTH], atol=1e-9)
-    np.testing.assert_allclose(noise_of(windows), cases.NOISE, rtol=0.2)
+    np.testing.assert_allclose(windows.noise, cases.NOISE, rtol=0.2)
     np.testing.assert_allclose(
         windows.frames @ np.swapaxes(windows.frames, -1, -2), np.eye(3) * np.ones((4, 100, 2, 1, 1)), atol=1e-6
     )
@@ -117,6 +117,40 @@ def test_a_gap_is_more_than_the_simulator_may_err_by():
     assert smallest_gap(1e-3, windows) == pytest.approx(3e-3, rel=0.03)
 
 
+def test_grippers_that_rest_are_never_fast():
+    """A cable that swings to rest between clamps: nothing is said of a speed that none has."""
+    log = cases.recording()
+    windows = windows_of(log)
+    windows = dataclasses.replace(windows, position=np.broadcast_to(windows.position[:1, :1], windows.position.shape))
+    before = np.nan_to_num(windows.keypoints) + 0.01
+    where = where_of(log, windows, in_log(log, windows, before), before, 1e-4, 1e-3, ())
+    assert set(where.regimes) == {"speed: slow"} and not any("nan" in text for text in where.sentences)
+
+
+@pytest.mark.parametrize("better", ["", "stiffness_profile"])
+def test_rest_curvature_is_tried_in_place_of_its_look_alike_too(monkeypatch, better):
+    windows = windows_of(cases.recording())
+    cable = SpatialCable(Rod(8, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows)
+    profile = cable.layout.named("stiffness_profile")
+    one, error = explanation((profile, 0, profile.null)), np.full(len(windows), 0.01)
+    steps = [Step("", True, (explanation(),) * 2, 2 * error, 0.0), Step(profile.name, True, (one, one), error, 0.9)]
+
+    def tried(cable, name, starts, before, progress, instead_of=""):
+        share = 0.5 if instead_of == better else 0.6
+        return Step(name, True, starts, share * before.error, 0.9, instead_of=instead_of)
+
+    monkeypatch.setattr("cablejax.spatial.identify.tried_with", tried)
+    steps += _twisted(cable, steps, lambda text: None)
+    assert [(step.effect, step.accepted) for step in steps[2:]] == [(TWISTED, False), (TWISTED, True)]
+    assert steps[-1].instead_of == better
+    assert steps[-1].halves[0].names == ((TWISTED,) if better else (profile.name, TWISTED))
+    found = Identified(cable, None, (), (), tuple(steps), None, (None, None), None)  # pyright: ignore[reportArgumentType]
+    assert [one.name for one in _ranking(found)] == [profile.name, TWISTED, TWISTED]
+    # as good by chance as on top of it: the two look alike
+    assert _equivalent(found, [profile.name]) == (() if better else ((profile.name, TWISTED),))
+    assert _equivalent(found, []) == ()
+
+
 def test_a_fit_finds_stiffness_and_damping():
     windows = windows_of(cases.recording())
     cable = SpatialCable(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL), windows)
@@ -191,11 +225,12 @@ def test_gravity_is_the_one_that_the_log_states():
     np.testing.assert_allclose(layout.physics(layout.null).gravity, gravity, rtol=1e-6)
 
 
-def test_a_keypoint_that_is_never_seen_is_named():
+@pytest.mark.parametrize("unseen", [0, 1, 4])
+def test_a_keypoint_that_is_never_seen_is_named(unseen):
     log = cases.recording()
     keypoints = log.keypoints.copy()
-    keypoints[:, :, 4] = np.nan
-    with pytest.raises(ValueError, match="Keypoint 4 is never observed"):
+    keypoints[:, :, unseen] = np.nan
+    with pytest.raises(ValueError, match=f"Keypoint {unseen} is never observed"):
         windows_of(dataclasses.replace(log, keypoints=keypoints))
 
 

@@ -18,7 +18,6 @@ from cablejax.spatial.cable import FINER, TWISTED, SpatialCable
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, restarts
 from cablejax.spatial.identify import Identified, TimeSteps, _for_predictions, layout_of
 from cablejax.spatial.named import named_effects, parameters_of, quantities_of, with_both_drags
-from cablejax.spatial.search import with_effect
 from cablejax.spatial.windows import windows_of
 
 _FOUND = ("bending_stiffness", "bending_damping")
@@ -189,7 +188,7 @@ def test_few_edges_and_long_steps_do_not_pass_for_another_stiffness(fitted):
 def test_does_not_stay_where_a_search_took_the_grips_astray(fitted):
     cable, best = fitted
     grips, said = cable.layout.named("gripper_rotation_offset"), []
-    start = with_effect(cable, best, grips, grips.null)
+    start = cable.with_own(best.plus((grips, 0, grips.null)))
     astray = start.moved(start.z, start.own + 8.0)
     told = estimate(cable, restarts(astray), (*_FOUND, grips.name), progress=said.append)
     assert told.settled and told.stiffness.value == pytest.approx(_TRUE_STIFFNESS, rel=0.02)

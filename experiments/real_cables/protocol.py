@@ -83,6 +83,7 @@ def protocol_windows(recordings: DeformRecordings) -> Windows:
         episode=np.arange(len(points)),
         begin=np.zeros(len(points), int),
         group=recordings.recording,
+        trust=np.ones(len(points)),
         split=tuple(recordings.split),
         name=tuple(str(n) for n in recordings.source_id),
         held=(2, 2),

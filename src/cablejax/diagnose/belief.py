@@ -28,7 +28,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from cablejax.diagnose.evidence import Evidence, episodes_by_motion
 from cablejax.diagnose.fit import Fit
@@ -36,8 +36,6 @@ from cablejax.diagnose.protocol import Explanation
 
 LEAST_SQUARES = 1e12
 """Degrees of freedom with which Student's distribution is a normal one."""
-# Each costs simulations of every motion that is considered.
-_MOST_IN_DOUBT = 5
 # In the logs on which `Calibration.as_good` was set.
 _MOTIONS = 6
 # fmt: off
@@ -179,8 +177,7 @@ def has_gap(null: Fit, evidence: Evidence, calibration: Calibration) -> bool:
     squares, count = _squares_by_motion(null, evidence)
     noise = level(evidence)
     own = np.full(len(evidence.count), calibration.baseline) if evidence.own_error is None else evidence.own_error
-    motions = [rows for rows in episodes_by_motion(evidence.motion) if evidence.count[rows].sum() > 0]
-    smallest = np.array([calibration.smallest_gap(noise, float(own[rows].max())) for rows in motions])
+    smallest = np.array([calibration.smallest_gap(noise, float(own[rows].max())) for rows in _seen_motions(evidence)])
     unit = (noise / smallest) ** 4
     fourth = ((np.maximum(squares, 0.0) / count) ** 2 - 2.0 / count) * unit
     # of the square of a normal variable, whose variance is 2 / count
@@ -199,21 +196,23 @@ def excused(null: Fit, evidence: Evidence, calibration: Calibration) -> list[tup
     """
     if evidence.own_error is None:
         return []
-    motions = [rows for rows in episodes_by_motion(evidence.motion) if evidence.count[rows].sum() > 0]
     usual = calibration.smallest_gap(level(evidence))
     return [
         (int(rows[0]), float(gap), own)
-        for rows, gap in zip(motions, left_by_motion(null, evidence), strict=True)
+        for rows, gap in zip(_seen_motions(evidence), left_by_motion(null, evidence), strict=True)
         if usual < gap and usual < (own := float(evidence.own_error[rows].max()))
     ]
 
 
+def _seen_motions(evidence: Evidence) -> list[Int[np.ndarray, "_"]]:
+    """The episodes of each motion of which something was observed."""
+    return [rows for rows in episodes_by_motion(evidence.motion) if evidence.count[rows].any()]
+
+
 def _squares_by_motion(fit: Fit, evidence: Evidence) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
     """Sum of squares above the noise, in its units, and number of coordinates, of each motion that was seen."""
-    motions = episodes_by_motion(evidence.motion)
-    squares = np.array([(fit.sse - evidence.count)[own].sum() for own in motions])
-    count = np.array([evidence.count[own].sum() for own in motions])
-    return squares[count > 0], count[count > 0]
+    motions, count = _seen_motions(evidence), evidence.count
+    return np.array([(fit.sse - count)[rows].sum() for rows in motions]), np.array([count[r].sum() for r in motions])
 
 
 def excess(fit: Fit, evidence: Evidence) -> float:
@@ -236,36 +235,6 @@ def log_scores(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration
         return float(evidence.log_likelihoods(fit.held_out_sse(evidence)).sum()) - cost
 
     return np.array([score(fit) for fit in fits])
-
-
-def in_doubt(
-    fits: Sequence[Fit], scores: Float[np.ndarray, "F"], evidence: Evidence, calibration: Calibration
-) -> tuple[list[Fit], Float[np.ndarray, "K"]]:
-    """Explanations that a verdict leaves open, and their probabilities, sum 1.
-
-    Those whose odds against the best are not small. One with another effect in the place of one of the best's that
-    merely leaves as little counts as if its odds were the smallest of these: a likelihood is that sure only if every
-    law is exact.
-
-    Args:
-        fits: of different sets of effects, best first.
-        scores: their log posterior.
-        evidence: that was fitted.
-        calibration: of the judgement.
-    """
-    best, names = fits[0], set(effect_names(fits[0].explanation))
-    kept, odds = [], []
-    for fit, score in zip(fits, scores, strict=True):
-        own, chance = set(effect_names(fit.explanation)), float(np.exp(score - scores[0]))
-        in_place = len(own) == len(names) and len(own & names) >= len(names) - 1
-        if chance < calibration.set_odds and in_place and as_good(fit, best, evidence, calibration):
-            chance = calibration.set_odds
-        if chance >= calibration.set_odds:
-            kept.append(fit)
-            odds.append(chance)
-    order = np.argsort(-np.array(odds), kind="stable")[:_MOST_IN_DOUBT]
-    chances = np.array(odds)[order]
-    return [kept[i] for i in order], chances / chances.sum()
 
 
 def effect_names(explanation: Explanation) -> tuple[str, ...]:

@@ -54,6 +54,7 @@ class Case:
     """A log, replayed by the nominal simulator.
 
     Attributes:
+        log: as it is read, with the cable and table believed in.
         recording: the log after checks and repairs.
         config: the nominal cable at the resolution of the fits.
         effects: that may be at work, as they were given: the simulator's have the cable's size and are where it is.
@@ -66,6 +67,7 @@ class Case:
         predicted: as `simulator`, under the poses that the arms' effects predict.
     """
 
+    log: GapLog
     recording: Recording
     config: Discretisation
     effects: Sequence[CableEffect]
@@ -143,6 +145,7 @@ class Case:
         moved = arms.deviates
         predicted = replay(FIT_LINKS, LARGEST_STEP, arms.predicted) if moved else playback
         return cls(
+            log=log,
             recording=recording,
             config=config,
             effects=effects,
@@ -250,8 +253,7 @@ class Case:
 
     def to_log(self, keypoints: Float[np.ndarray, "E T N 2"]) -> Float[np.ndarray, "E T1 N 2"]:
         """Pads an array to the log's length, with NaN beyond each episode's end."""
-        valid = np.arange(keypoints.shape[1])[None] < self.recording.length[:, None]
-        return np.where(valid[..., None, None], keypoints, np.nan)[:, : self.recording.length.max()]
+        return np.where(self.recording.valid[..., None, None], keypoints, np.nan)[:, : self.recording.length.max()]
 
 
 def _steadied(pose: Float[np.ndarray, "E T 2 3"], recording: Recording, arms: Actuation):

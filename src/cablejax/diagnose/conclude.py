@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +14,6 @@ from scipy.special import softmax
 
 from cablejax.arrays import wrapped
 from cablejax.diagnose.belief import (
-    Calibration,
     as_good,
     effect_names,
     excess,
@@ -32,7 +32,6 @@ from cablejax.diagnose.diagnosis import (
     UnderLaw,
     Verdict,
 )
-from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.gap import shrinkage
 from cablejax.diagnose.judgement import beside_unknown, judged, verdict_sentence
@@ -76,49 +75,46 @@ class Conclusion:
     nothing: float = 0.0
 
 
-def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: Sequence[Law] = ()) -> Conclusion:
+def conclude(found: Search, laws: Sequence[Law] = ()) -> Conclusion:
     """Probabilities, equivalence sets and the verdict.
 
     Args:
         found: by the search.
-        evidence: that was explained.
-        calibration: of the judgement.
         laws: what was found by the simulator's other laws: the verdict is not theirs, but its intervals hold over all,
             and where the most probable one leaves no gap, no effect is named.
     """
-    conclusion, drawn = _concluded(found, evidence, calibration, laws)
+    conclusion, drawn = _concluded(found, laws)
     if not conclusion.effects:
         return conclusion
-    every = posterior(found, evidence, calibration, drawn)
+    every = posterior(found, drawn)
     return dataclasses.replace(conclusion, posterior=every, nothing=every.count(()) / max(len(every), 1))
 
 
 def _concluded(
-    found: Search,
-    evidence: Evidence,
-    calibration: Calibration,
-    laws: Sequence[Law] = (),
-    drawn: Float[np.ndarray, "D P"] | None = None,
+    found: Search, laws: Sequence[Law] = (), drawn: Float[np.ndarray, "D P"] | None = None
 ) -> tuple[Conclusion, Float[np.ndarray, "D P"]]:
     """The conclusion without its posterior, and draws of the best fit's coordinates over all laws.
 
     `drawn` are draws by the simulator's own law, where there are some.
     """
-    nothing = np.zeros((0, 0))
-    chances = softmax(found.scores)
-    best = found.fits[0]
-    null = next(fit for fit in found.fits if not fit.explanation.terms)
-    gap = excess(null, evidence)
-    left = excess(best, evidence)
-    explained = 1.0 - (left / gap) ** 2 if gap > 0 else 0.0
-    ranking = _ranking(found, evidence)
-    if not has_gap(null, evidence, calibration):
-        return Conclusion("none", null, (), (), ranking, 0.0), nothing
-    as_much = leftover_p(leftover_score(left, gap, level(evidence), calibration), evidence.simulator.right_scores)
-    shared = [drawn_by(law, best, calibration) for law in laws]
-    under = tuple(_under(law, calibration, drawn) for law, drawn in zip(laws, shared, strict=True))
+    evidence, calibration, simulator = found.evidence, found.calibration, found.evidence.simulator
+    best, nothing = found.fits[0], np.zeros((0, 0))
+    gap, left = excess(found.null, evidence), excess(best, evidence)
+    none = Conclusion("none", found.null, (), (), _ranking(found), 0.0)
+    if not has_gap(found.null, evidence, calibration):
+        return none, nothing
+    shared = [drawn_by(law, best) for law in laws]
+    under = tuple(itertools.starmap(_under, zip(laws, shared, strict=True)))
     if _excused(under):
-        return Conclusion("none", null, (), (), ranking, 0.0, None, (), under), nothing
+        return dataclasses.replace(none, under_laws=under), nothing
+    unknown = dataclasses.replace(
+        none,
+        verdict="unknown",
+        best=best,
+        explained=1.0 - (left / gap) ** 2 if gap > 0 else 0.0,
+        leftover_p=leftover_p(leftover_score(left, gap, level(evidence), calibration), simulator.right_scores),
+        under_laws=under,
+    )
     if not best.explanation.terms:
         # an effect would do, and yet the gap is too small or in too few motions to pay for it
         undecided = any(
@@ -126,43 +122,41 @@ def _concluded(
             for fit in found.fits
             if fit.explanation.terms
         )
-        return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under, undecided), nothing
+        return dataclasses.replace(unknown, undecided=undecided), nothing
+    complete = calibration.complete(left, gap, level(evidence))
+    if not _telling(best, unknown.explained, complete, found):
+        return unknown, nothing
 
     own = draws(evidence, best, calibration) if drawn is None else drawn
     drawn = over_laws(own, [(law.probability, each[1]) for law, each in zip(laws, shared, strict=True) if each])
-    effects, equivalent = [], []
-    for name in effect_names(best.explanation):
-        rest = set(effect_names(best.explanation)) - {name}
-        odds: dict[str, float] = {}
-        alike_by_size: set[str] = set()
-        for fit, chance in zip(found.fits, chances, strict=True):
-            names = set(effect_names(fit.explanation))
-            # the same explanation with another effect in this one's place
-            if len(names) == len(rest) + 1 and rest <= names:
-                (other,) = names - rest
-                odds[other] = odds.get(other, 0.0) + float(chance)
-                if as_good(fit, best, evidence, calibration):
-                    alike_by_size.add(other)
-        total = sum(odds.values())
-        # In a wide gap a likelihood is sure of differences that are small compared with the error of any law.
-        alike = sorted(
-            (n for n in odds if odds[n] >= calibration.set_odds * odds[name] or n in alike_by_size),
-            key=lambda n: -odds[n],
-        )
-        if len(alike) > 1:
-            equivalent.append(tuple(alike))
-        chance_of = {other: odds[other] / total for other in alike}
-        effects += _named(name, best, chance_of, drawn, evidence.simulator)
-    complete = calibration.complete(left, gap, level(evidence))
-    telling = _telling(best, null, explained, complete, evidence, calibration)
-    verdict = judged(resolvable=True, telling=telling, complete=complete, alike=bool(equivalent))
-    if verdict == "unknown":
-        return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under), nothing
-    order = np.argsort([-e.probability for e in effects], kind="stable")
-    named = tuple(effects[i] for i in order)
+    chances = {name: _in_its_place(name, found) for name in effect_names(best.explanation)}
+    equivalent = tuple(tuple(alike) for alike in chances.values() if len(alike) > 1)
+    verdict = judged(resolvable=True, telling=True, complete=complete, alike=bool(equivalent))
+    effects = [one for name, alike in chances.items() for one in _named(name, best, alike, drawn, simulator)]
+    effects.sort(key=lambda effect: -(effect.probability or 0.0))
     if verdict == "named+unknown":
-        named = tuple(beside_unknown(effect, evidence.simulator.beside_unknown) for effect in named)
-    return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much, (), under), drawn
+        effects = [beside_unknown(effect, simulator.beside_unknown) for effect in effects]
+    return dataclasses.replace(unknown, verdict=verdict, effects=tuple(effects), equivalent=equivalent), drawn
+
+
+def _in_its_place(name: str, found: Search) -> dict[str, float]:
+    """Probabilities of an effect of the best explanation, and of those that could replace it; most probable first."""
+    best = found.fits[0]
+    rest = set(effect_names(best.explanation)) - {name}
+    odds: dict[str, float] = {}
+    alike_by_size: set[str] = set()
+    for fit, chance in zip(found.fits, softmax(found.scores).tolist(), strict=True):
+        names = set(effect_names(fit.explanation))
+        # the same explanation with another effect in this one's place
+        if len(names) == len(rest) + 1 and rest <= names:
+            (other,) = names - rest
+            odds[other] = odds.get(other, 0.0) + chance
+            if as_good(fit, best, found.evidence, found.calibration):
+                alike_by_size.add(other)
+    least, total = found.calibration.set_odds * odds[name], sum(odds.values())
+    # In a wide gap a likelihood is sure of differences that are small compared with the error of any law.
+    alike = (other for other in odds if odds[other] >= least or other in alike_by_size)
+    return {other: odds[other] / total for other in sorted(alike, key=lambda other: -odds[other])}
 
 
 def _excused(under: Sequence[UnderLaw]) -> bool:
@@ -172,15 +166,16 @@ def _excused(under: Sequence[UnderLaw]) -> bool:
     return likeliest is not None and likeliest.probability > own and likeliest.verdict == "none"
 
 
-def _under(law: Law, calibration: Calibration, shared: tuple[Fit, Float[np.ndarray, "D P"]] | None) -> UnderLaw:
+def _under(law: Law, shared: tuple[Fit, Float[np.ndarray, "D P"]] | None) -> UnderLaw:
     """The verdict by another law alone; `shared` are a fit by it and draws of its coordinates."""
     drawn = shared[1] if shared is not None and shared[0] is law.found.fits[0] else None
-    other, _ = _concluded(law.found, law.evidence, calibration, drawn=drawn)
+    other, _ = _concluded(law.found, drawn=drawn)
     return UnderLaw(law.assumes, law.probability, other.verdict, other.effects, other.equivalent)
 
 
-def _telling(best: Fit, null: Fit, explained: float, complete: bool, evidence, calibration: Calibration) -> bool:
+def _telling(best: Fit, explained: float, complete: bool, found: Search) -> bool:
     """Whether enough of the gap goes away to name an explanation, see `judged`."""
+    null, evidence, calibration = found.null, found.evidence, found.calibration
     if best.refits is None or null.refits is None:
         return complete or explained >= calibration.telling or explains_most_motions(best, null, evidence, calibration)
     before, after = (fit.refits.sse - evidence.count for fit in (null, best) if fit.refits is not None)
@@ -188,15 +183,13 @@ def _telling(best: Fit, null: Fit, explained: float, complete: bool, evidence, c
     return interval is not None and interval[0] > 0
 
 
-def _ranking(found: Search, evidence: Evidence) -> tuple[Ranked, ...]:
-    singles = [(f, s) for f, s in zip(found.fits, found.scores, strict=True) if len(effect_names(f.explanation)) == 1]
-    if not singles:
+def _ranking(found: Search) -> tuple[Ranked, ...]:
+    if not found.singles:
         return ()
-    chances = softmax(np.array([s for _, s in singles]))
-    null = next(fit for fit in found.fits if not fit.explanation.terms)
+    evidence, null, result = found.evidence, found.null, []
     before = max(float(null.held_out_sse(evidence).sum()) - evidence.count.sum(), 1e-9)
-    result = []
-    for (fit, _), chance in zip(singles, chances, strict=True):
+    for i, chance in zip(found.singles, softmax(found.scores[found.singles]), strict=True):
+        fit = found.fits[i]
         held_out = float(fit.held_out_sse(evidence).sum()) - evidence.count.sum()
         result.append(
             Ranked(

@@ -104,9 +104,8 @@ class Fit:
             whole[np.ix_(block, block)] += curved[n:, n:]
             whole[:n, block], whole[block, :n] = curved[:n, n:], curved[n:, :n]
         wide = np.full(len(point) - n, np.inf)
-        return Linearised(
-            point, np.append(lower, -wide), np.append(upper, wide), cost, pull, whole, self, blocks
-        )  # fmt: skip
+        lower, upper = np.append(lower, -wide), np.append(upper, wide)
+        return Linearised(point, lower, upper, cost, pull, whole, self, blocks)
 
     def at(self, point: Float[np.ndarray, "C"]) -> Explanation:
         """The explanation at a point of `model`."""

@@ -141,6 +141,8 @@ def shrinkage(
 def _split(before, after, noise, resolvable: bool, learnable: float | None) -> dict[str, float | None]:
     """Shares of the squared error before, see `Gap.split`."""
     total = before.sum()
+    if not total > 0:  # a simulation that is exact to the last digit
+        return {"noise": 1.0, "named": 0.0, "learnable": None if learnable is None else 0.0, "unexplained": 0.0}
     share = float(min(noise.sum() / total, 1.0))
     named = float(max((before - np.maximum(after, noise)).sum(), 0.0) / total) if resolvable else 0.0
     left = max(1.0 - share - named, 0.0)

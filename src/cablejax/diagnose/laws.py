@@ -13,8 +13,6 @@ import dataclasses
 
 import numpy as np
 
-from cablejax.diagnose.belief import Calibration, in_doubt, log_scores
-from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.refits import refitted
@@ -27,46 +25,32 @@ class Law:
 
     Attributes:
         assumes: in words.
-        evidence: the same recording, predicted by this law.
         found: fits by this law.
         probability: of the law, among all.
     """
 
     assumes: str
-    evidence: Evidence
     found: Search
     probability: float
 
 
-def by_other_laws(found: Search, evidence: Evidence, calibration: Calibration) -> tuple[Law, ...]:
-    """Fits what a search left open by each of the simulator's other laws.
-
-    Args:
-        found: by the simulator's own law.
-        evidence: that was explained.
-        calibration: of the judgement.
-    """
-    others = evidence.simulator.other_laws
+def by_other_laws(found: Search) -> tuple[Law, ...]:
+    """Fits what a search by the simulator's own law left open by each of its other laws."""
+    others = found.evidence.simulator.other_laws
     if not others:
         return ()
-    open_fits, _ = in_doubt(found.fits, found.scores, evidence, calibration)
-    leading = [fit.explanation for fit in open_fits if fit.explanation.terms]
-    searches, evidences = [], []
+    leading = [fit.explanation for fit in found.in_doubt()[0] if fit.explanation.terms]
+    searches = []
     for simulator in others.values():
-        bare = dataclasses.replace(evidence, simulator=simulator)
+        bare = dataclasses.replace(found.evidence, simulator=simulator)
         other = dataclasses.replace(bare, nominal=bare.predict([explanation()])[0])
         *starts, null = evaluate(other, [*leading, explanation()])
         fits = improve(other, starts, simulator.plan.last_steps)
-        fits = refitted(other, [*fits, null])
-        scores = log_scores(fits, other, calibration)
-        best_first = np.argsort(-scores, kind="stable")
-        searches.append(Search(tuple(fits[i] for i in best_first), scores[best_first], {}))
-        evidences.append(other)
+        searches.append(Search.of(refitted(other, [*fits, null]), other, found.calibration))
     tried = [set(one.terms) for one in leading] + [set()]
     own = [score for fit, score in zip(found.fits, found.scores, strict=True) if set(fit.explanation.terms) in tried]
     totals = np.array([np.logaddexp.reduce(own), *(np.logaddexp.reduce(search.scores) for search in searches)])
     chances = np.exp(totals - np.logaddexp.reduce(totals))[1:]
     return tuple(
-        Law(assumes, other, search, float(chance))
-        for assumes, other, search, chance in zip(others, evidences, searches, chances, strict=True)
+        Law(assumes, search, float(chance)) for assumes, search, chance in zip(others, searches, chances, strict=True)
     )

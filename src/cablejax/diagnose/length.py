@@ -14,7 +14,6 @@ from cablejax.diagnose.case import Case
 from cablejax.diagnose.diagnosis import ParameterEstimate
 from cablejax.diagnose.reading import Reading
 from cablejax.diagnose.recording import DiagnosisError
-from cablejax.types import GapLog
 
 # Keypoints that are closer together or further apart than stated by more than this share are reported.
 _OFF = 0.004
@@ -27,13 +26,11 @@ class Length(Reading):
     """A length that differs from the stated one.
 
     Attributes:
-        log: of a cable of the measured length, its keypoints at the same shares of it.
-        case: of that log; None where the cable would be torn.
+        case: of a cable of the measured length, its keypoints at the same shares of it; None where it would be torn.
         stated: in the given log [m].
         measured: from the keypoints [m].
     """
 
-    log: GapLog
     case: Case | None
     stated: float
     measured: float
@@ -63,20 +60,15 @@ class Length(Reading):
             "keypoint_arclength_m."
         )
 
-    def told(self, diagnosis, probability):
+    def noted_in(self, diagnosis, probability):
         """With the measured length among the quantities."""
-        measured = {"length_m": ParameterEstimate(self.measured, None, "m")}
-        told = super().told(diagnosis, probability)
-        return dataclasses.replace(told, quantities=told.quantities | measured)
+        quantities = diagnosis.quantities | {"length_m": ParameterEstimate(self.measured, None, "m")}
+        return super().noted_in(dataclasses.replace(diagnosis, quantities=quantities), probability)
 
 
-def other_length(case: Case, log: GapLog) -> Length | None:
-    """The length that the keypoints suggest, if all their deviations from the stated one have the same sign.
-
-    Args:
-        case: of the log.
-        log: with the stated length.
-    """
+def other_length(case: Case) -> Length | None:
+    """The length that the keypoints suggest, if all their deviations from the stated one have the same sign."""
+    log = case.log
     ratio = _closeness(case)
     if not len(ratio) or np.abs(ratio - 1).min() <= _OFF or np.ptp(np.sign(ratio - 1)) > 0:
         return None
@@ -87,9 +79,9 @@ def other_length(case: Case, log: GapLog) -> Length | None:
     other = dataclasses.replace(log, meta=log.meta | {"cable": cable, "keypoint_arclength_m": marks})
     try:
         settling = case.simulator.playback.settling
-        return Length(other, Case.of(other, case.effects, settling=settling), stated, measured)
+        return Length(Case.of(other, case.effects, settling=settling), stated, measured)
     except DiagnosisError:
-        return Length(other, None, stated, measured)
+        return Length(None, stated, measured)
 
 
 def _closeness(case: Case) -> np.ndarray:

@@ -130,9 +130,8 @@ def read_bounds(path: str | os.PathLike[str]) -> Bounds:
     for key, value in fields.items():
         if key not in KEYS:
             raise ValueError(f"{path} has {unknown_key(key, {known: unit for known, (_, unit) in KEYS.items()})}")
-        values[KEYS[key][0]] = _rows(value, 2, f"{path}: {key}") if key == "workspace_m" else value
-        if key == "keep_out_m":
-            values["keep_out"] = _rows(value, 3, f"{path}: {key}")
+        width = {"workspace_m": 2, "keep_out_m": 3}.get(key)
+        values[KEYS[key][0]] = value if width is None else _rows(value, width, f"{path}: {key}")
     try:
         return Bounds(**values)
     except ValueError as error:

@@ -9,15 +9,14 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.belief import Calibration, in_doubt
-from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import Fit
+from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.information import entropy, mutual_information, parameter_information
 from cablejax.diagnose.motion_bounds import SNAP_THROUGH, Bounds, cable_beyond, grippers_beyond
 from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.diagnose.safe_motions import INTERVAL
+from cablejax.diagnose.search import Search
 
 CLAMP_ERROR = 0.02
 """Standard deviation of a clamp's angle to its gripper [rad]: on each recording it is another one, and near a
@@ -75,32 +74,13 @@ class Judge:
     objective: Objective = "explanations"
 
     @classmethod
-    def of(
-        cls,
-        playback: Playback,
-        fits: Sequence[Fit],
-        scores: Float[np.ndarray, "F"],
-        evidence: Evidence,
-        calibration: Calibration,
-        bounds: Bounds = Bounds(),
-        objective: Objective = "explanations",
-    ) -> Judge:
-        """The judge after a diagnosis, with the explanations that it leaves open; see `belief.in_doubt`.
-
-        Args:
-            playback: of the log's motions.
-            fits: all that were fitted, best first.
-            scores: their log posterior.
-            evidence: that they were fitted to.
-            calibration: of the judgement.
-            bounds: to keep.
-            objective: see the attributes.
-        """
-        kept, chances = in_doubt(fits, scores, evidence, calibration)
-        roots = tuple(np.linalg.cholesky(np.linalg.inv(fit.precision(evidence))) for fit in kept)
-        noise = np.broadcast_to(evidence.noise, (playback.config.cable.n_keypoints, 1))[:, 0]
+    def of(cls, playback: Playback, found: Search, bounds: Bounds, objective: Objective) -> Judge:
+        """The judge after a diagnosis of the playback's motions, with the explanations that `found` leaves open."""
+        kept, chances = found.in_doubt()
+        roots = tuple(np.linalg.cholesky(np.linalg.inv(fit.precision(found.evidence))) for fit in kept)
+        noise = np.broadcast_to(found.evidence.noise, (playback.config.cable.n_keypoints, 1))[:, 0]
         explanations = tuple(fit.explanation for fit in kept)
-        return cls(playback, explanations, chances, roots, noise, calibration, bounds, objective)
+        return cls(playback, explanations, chances, roots, noise, found.calibration, bounds, objective)
 
     @property
     def about_parameters(self) -> bool:
@@ -114,8 +94,8 @@ class Judge:
 
     @property
     def simulations(self) -> int:
-        """Simulations for each motion: without any effect, of every explanation and parameter, and of either clamp."""
-        return 3 + sum(1 + len(one.z) + (_as_it_is(one) is not one) for one in self.explanations)
+        """Simulations for each motion: those of `_asked`, and of either clamp."""
+        return len(self._asked()) + 2
 
     def judged(self, motions: Sequence[Float[np.ndarray, "T 2 3"]]) -> list[Judged]:
         """Judges motions of one length; those whose grippers keep all bounds are simulated together."""
@@ -205,6 +185,4 @@ class Judge:
 def _as_it_is(one: Explanation) -> Explanation:
     """The explanation without effects of the camera, which sees the cable where it is not; itself if it has none."""
     names = [term.effect.name for term in one.terms if getattr(term.effect, "side", "dynamics") == "observation"]
-    for name in dict.fromkeys(names):
-        one = one.without(name)
-    return one
+    return one.without(*names) if names else one

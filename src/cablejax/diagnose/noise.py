@@ -74,24 +74,17 @@ def noise_floor(
         ValueError: fewer than 20 observed samples of every keypoint, or no noise at all.
     """
     rapid, n_rapid = _differences(keypoints, order)
-    level = float(np.average(rapid, weights=np.maximum(n_rapid, 1e-9)))
-    held = _held(keypoints, hold) if hold is not None else None
-    if held is None:
-        variance, count, correlation, from_holds, restless = rapid, n_rapid, np.zeros(_LAGS), False, 0
-    else:
-        variance, count, correlation, restless = held
-        from_holds = True
-        if abs(correlation[0]) < _scattered(count):
-            slow = float(np.average(variance, weights=np.maximum(count, 1e-9)))
-            # white noise has one level at all frequencies; a jerky recording does not
-            if abs(level / slow - 1) < 0.1:
-                variance, count = rapid, n_rapid
+    level, held = _pooled(rapid, n_rapid), None if hold is None else _held(keypoints, hold)
+    variance, count, correlation, restless = held or (rapid, n_rapid, np.zeros(_LAGS), 0)
+    # white noise has one level at all frequencies; a jerky recording does not
+    if held and abs(correlation[0]) < _scattered(count) and abs(level / _pooled(variance, count) - 1) < 0.1:
+        variance, count = rapid, n_rapid
     if count.max() < 20:
         raise ValueError(
             "The noise cannot be estimated: no keypoint is observed often enough, expected at least 20 times in holds, "
             f"or 20 times more than {order} in an episode."
         )
-    common = float(np.average(variance, weights=np.maximum(count, 1e-9)))
+    common = _pooled(variance, count)
     smallest = max(smallest, _rounding(keypoints))
     common, variance = max(common, smallest**2), np.maximum(variance, smallest**2)
     if not common > 0:
@@ -99,9 +92,12 @@ def noise_floor(
     error = common * np.sqrt(2.0 / np.maximum(count, 1.0))
     distinct = (np.abs(variance - common) > _DISTINCT * error) & (count >= 20)
     std = np.sqrt(np.where(distinct, variance, common))
-    return NoiseFloor(
-        std=std, correlation=correlation, from_holds=from_holds, rapid=math.sqrt(level), restless=restless
-    )
+    return NoiseFloor(std, correlation, from_holds=held is not None, rapid=math.sqrt(level), restless=restless)
+
+
+def _pooled(variance: Float[np.ndarray, "N"], count: Float[np.ndarray, "N"]) -> float:
+    """One variance of all keypoints."""
+    return float(np.average(variance, weights=np.maximum(count, 1e-9)))
 
 
 def _rounding(keypoints) -> float:

@@ -74,28 +74,25 @@ def diagnose(
     """
     begin = time.perf_counter()
     case = Case.of(log, effects)
-    calibration, stated = _constants(log, case, calibration, commissioning)
+    calibration, stated = _constants(case, calibration, commissioning)
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
-    log, case, evidence, found, conclusion, length, taken = _read(log, case, calibration, progress)
+    case, found, conclusion, length, taken = _read(case, calibration, progress)
     alone, conclusion = conclusion, with_arms(conclusion, case.arms, calibration, case.config.cable.length)
 
     progress("fitting without each episode in turn")
-    gap, reference, after = _measured(case, evidence, conclusion)
+    gap, reference, after = _measured(case, found.evidence, conclusion)
     if not case.arms.deviates:
         conclusion = _worth_naming(conclusion, gap.shrinkage)
     following, none_kept = None, ()
     if conclusion.verdict != "none":
         progress("choosing the next motion" if bounds is None else "designing the next motion")
-        judge = Judge.of(
-            case.simulator.playback, found.fits, found.scores, evidence, calibration, bounds or Bounds(), objective
-        )
+        judge = Judge.of(case.simulator.playback, found, bounds or Bounds(), objective)
         following, none_kept = _following(judge, None if bounds is None else DesignConfig())
-    repaired = case.recording.as_log(log.meta)
-    rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
-    caveats = [*contradictions(rounds), *silent_motions(evidence, conclusion, calibration)]
+    repaired, rounds = case.recording.as_log(case.log.meta), rounds_of(case.log, found)
+    caveats = [*contradictions(rounds), *silent_motions(found.evidence, conclusion, calibration)]
     caveats += [*caveats_of(case, calibration, length, stated, commissioned=bool(commissioning)), *none_kept]
-    fields = Examined(evidence, found, conclusion, reference, after, gap).fields()
+    fields = Examined(found, conclusion, reference, after, gap).fields()
     if case.arms.strays(negligible(calibration, case.config.cable.length)) and alone.verdict in _ARMS_TOO:
         # what is left of the gap is theirs: not a share that right explanations leave, nor for an unknown cause to take
         fields |= {"sentence": _ARMS_TOO[alone.verdict].format(sentence(alone, None)), "leftover_p": None}
@@ -118,18 +115,17 @@ def diagnose(
         settings={**settings_of(case.simulator, calibration), "links": {"fit": FIT_LINKS, "nominal": FINE_LINKS}},
     )
     for reading, probability in taken:
-        diagnosis = reading.told(diagnosis, probability)
+        diagnosis = reading.noted_in(diagnosis, probability)
     return diagnosis
 
 
-def _constants(
-    log: GapLog, case: Case, given: Calibration | None, commissioning: Sequence[GapLog]
-) -> tuple[Calibration, float]:
-    """The constants of the judgement, and what wrongly stated numbers make of them [m]; 0 with constants given."""
-    calibration, stated = given or calibrated(log.meta["cable"]["length_m"]), 0.0
+def _constants(case: Case, given: Calibration | None, commissioning: Sequence[GapLog]) -> tuple[Calibration, float]:
+    """The constants of the judgement, and the error by wrongly stated numbers in them [m]; 0 with constants given."""
+    calibration, stated = given or calibrated(case.config.cable.length), 0.0
     if commissioning:
         # of the log's set-up, and none the log itself
-        joined([log, *commissioning], ["the log", *(f"commissioning log {i + 1}" for i in range(len(commissioning)))])
+        names = ["the log", *(f"commissioning log {i + 1}" for i in range(len(commissioning)))]
+        joined([case.log, *commissioning], names)
         calibration = dataclasses.replace(calibration, baseline=baseline_error(commissioning))
     if given is None:
         stated = case.stated_error()
@@ -139,32 +135,30 @@ def _constants(
 
 
 def _read(
-    log: GapLog, case: Case, calibration: Calibration, progress: Callable[[str], None]
-) -> tuple[GapLog, Case, Evidence, Search, Conclusion, Length | None, list[tuple[Reading, float]]]:
+    case: Case, calibration: Calibration, progress: Callable[[str], None]
+) -> tuple[Case, Search, Conclusion, Length | None, list[tuple[Reading, float]]]:
     """Explains a log, and again by another reading as long as one is more probable than all else together.
 
     Returns:
-        The log as it is most probably to be read, its case and what explains it, the length that the keypoints suggest
+        The case of the log as it is most probably to be read, what explains it, the length that the keypoints suggest
         besides the stated one, and the readings that are not literal with their probabilities.
     """
     taken: list[tuple[Reading, float]] = []
     while True:
-        length = None if any(isinstance(one, Length) for one, _ in taken) else other_length(case, log)
-        readings = [one for one in (length, held(case, log, calibration)) if one is not None]
+        length = None if any(isinstance(one, Length) for one, _ in taken) else other_length(case)
+        readings = [one for one in (length, held(case, calibration)) if one is not None]
         case = with_readings(case, readings)
-        evidence, found, conclusion = _explained(case, calibration, progress)
+        found, conclusion = _explained(case, calibration, progress)
         likely = [(one, one.probability(conclusion.under_laws)) for one in readings]
         reading, probability = max(likely, key=lambda one: one[1], default=(None, 0.0))
         if reading is None or reading.case is None or probability <= 0.5:
-            return log, case, evidence, found, conclusion, length, taken
+            return case, found, conclusion, length, taken
         progress(f"diagnosing again, assuming that {reading.assumes}")
         taken.append((reading, probability))
-        log, case = reading.log, reading.case
+        case = reading.case
 
 
-def _explained(
-    case: Case, calibration: Calibration, progress: Callable[[str], None]
-) -> tuple[Evidence, Search, Conclusion]:
+def _explained(case: Case, calibration: Calibration, progress: Callable[[str], None]) -> tuple[Search, Conclusion]:
     """Explains a case, and again where small errors grow more under the best explanation than was assumed.
 
     A soft cable may snap over in a motion in which the stated one does not. Explanations would then be judged by how
@@ -172,11 +166,10 @@ def _explained(
     """
     growth = case.growth(explanation())
     while True:
-        evidence = case.evidence(calibration, growth)
-        found, conclusion = explain(evidence, calibration, progress=progress)
+        found, conclusion = explain(case.evidence(calibration, growth), calibration, progress=progress)
         under = np.maximum(growth, case.growth(conclusion.best.explanation))
         if (under <= _MORE_GROWTH * growth).all():
-            return evidence, found, conclusion
+            return found, conclusion
         progress("diagnosing again, since small errors grow under the best explanation")
         growth = under
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.belief import Calibration, in_doubt
+from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import EffectValues
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate
@@ -38,25 +38,30 @@ def draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.nd
     Where parts of the recordings were left out, how far that moves them (jackknife) adds to the posterior's width, and
     the distribution is Student's with a degree of freedom fewer than parts; else they follow profiles of the posterior.
     """
-    random = np.random.default_rng(0)
-    if not len(fit.explanation.z):
+    random, best = np.random.default_rng(0), fit.explanation
+    if not len(best.z):
         return np.zeros((_DRAWS, 0))
+    covariance, centre = np.linalg.inv(fit.precision(evidence)), np.zeros(len(best.z))
     if fit.refits is None:
-        return scaled_draws(evidence, fit, calibration.widening, _DRAWS, random)
-    z = np.stack([one.z for one in fit.refits.explanations])
-    parts = len(z)
-    covariance = np.linalg.inv(fit.precision(evidence)) + (parts - 1) * np.cov(z.T, bias=True).reshape(2 * z.shape[1:])
-    normal = random.multivariate_normal(np.zeros(len(covariance)), covariance, _JACKKNIFE_DRAWS, method="cholesky")
-    drawn = fit.explanation.z + normal * np.sqrt((parts - 1) / random.chisquare(parts - 1, (_JACKKNIFE_DRAWS, 1)))
-    return np.clip(drawn, *fit.explanation.bounds.T)
+        # normal, stretched on each side to the width of the profile
+        normal = random.multivariate_normal(centre, covariance, _DRAWS, method="cholesky")
+        down, up = (profile_widths(evidence, fit) / (QUANTILE * np.sqrt(np.diagonal(covariance)))[:, None]).T
+        drawn = best.z + calibration.widening * normal * np.where(normal < 0, down, up)
+    else:
+        z = np.stack([one.z for one in fit.refits.explanations])
+        freedom = len(z) - 1
+        covariance = covariance + freedom * np.cov(z.T, bias=True).reshape(2 * z.shape[1:])
+        normal = random.multivariate_normal(centre, covariance, _JACKKNIFE_DRAWS, method="cholesky")
+        drawn = best.z + normal * np.sqrt(freedom / random.chisquare(freedom, (_JACKKNIFE_DRAWS, 1)))
+    return np.clip(drawn, *best.bounds.T)
 
 
-def drawn_by(law: Law, best: Fit, calibration: Calibration) -> tuple[Fit, Float[np.ndarray, "D P"]] | None:
+def drawn_by(law: Law, best: Fit) -> tuple[Fit, Float[np.ndarray, "D P"]] | None:
     """The fit of the same terms by another law, and draws of its coordinates; None where the law counts for nothing."""
     same = next((fit for fit in law.found.fits if fit.explanation.terms == best.explanation.terms), None)
     if same is None or not same.explanation.terms or law.probability < 1.0 / _DRAWS:
         return None
-    return same, draws(law.evidence, same, calibration)
+    return same, draws(law.found.evidence, same, law.found.calibration)
 
 
 def over_laws(
@@ -76,22 +81,19 @@ def over_laws(
     return np.random.default_rng(0).permutation(np.concatenate([own[:rest], *parts]))[: len(own)]
 
 
-def posterior(
-    found: Search, evidence: Evidence, calibration: Calibration, best: Float[np.ndarray, "D P"]
-) -> tuple[tuple[EffectValues, ...], ...]:
+def posterior(found: Search, best: Float[np.ndarray, "D P"]) -> tuple[tuple[EffectValues, ...], ...]:
     """Explanations that the verdict leaves open with their values, each as often as it is probable.
 
     Args:
         found: by the search.
-        evidence: that was fitted.
-        calibration: of the judgement.
         best: draws of the best fit's coordinates, in no order.
     """
-    fits, chances = in_doubt(found.fits, found.scores, evidence, calibration)
+    fits, chances = found.in_doubt()
+    evidence = found.evidence
     taken = np.searchsorted(np.cumsum(chances), (np.arange(POSTERIOR) + 0.5) / POSTERIOR)
     result = []
     for k in np.unique(np.minimum(taken, len(fits) - 1)):
-        drawn = best if fits[k] is found.fits[0] else draws(evidence, fits[k], calibration)
+        drawn = best if fits[k] is found.fits[0] else draws(evidence, fits[k], found.calibration)
         for z in drawn[: int(np.sum(taken == k))]:
             terms = fits[k].explanation.by_term(z)
             reports = [(term, evidence.simulator.report(term, term.values(value))) for term, value in terms]
@@ -128,25 +130,6 @@ def profile_widths(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "P 2"]:
             scale = np.sqrt(0.5 * QUANTILE**2 / rise) if rise > 0 else _MOST
             width[i, side] = min(width[i, side], room[i, side]) * float(np.clip(scale, _LEAST, _MOST))
     return np.minimum(width, room)
-
-
-def scaled_draws(
-    evidence: Evidence, fit: Fit, widening: float, count: int, rng: np.random.Generator
-) -> Float[np.ndarray, "D P"]:
-    """Posterior draws of coordinates: normal, stretched on each side to the width of the profile.
-
-    Args:
-        evidence: that was fitted.
-        fit: at its optimum.
-        widening: all widths are multiplied by this.
-        count: of draws.
-        rng: for them.
-    """
-    covariance = np.linalg.inv(fit.precision(evidence))
-    draws = rng.multivariate_normal(np.zeros(len(covariance)), covariance, size=count, method="cholesky")
-    down, up = (profile_widths(evidence, fit) / (QUANTILE * np.sqrt(np.diagonal(covariance)))[:, None]).T
-    moved = fit.explanation.z + widening * draws * np.where(draws < 0, down, up)
-    return np.clip(moved, *fit.explanation.bounds.T)
 
 
 def _profiled_cost(trial: Fit, weight: Float[np.ndarray, "E"], fixed: int) -> float:

@@ -103,9 +103,14 @@ class Explanation:
         """Names of the effects."""
         return tuple(term.effect.name for term in self.terms)
 
-    def without(self, name: str) -> Explanation:
-        """The explanation without one of its effects."""
-        kept = [(term, z) for term, z in self.by_term() if term.effect.name != name]
+    def plus(self, *parts: tuple[Effect, int, Sequence[float]]) -> Explanation:
+        """The explanation with more effects, given as to the function `explanation`."""
+        more = explanation(*parts)
+        return Explanation((*self.terms, *more.terms), np.append(self.z, more.z), self.own)
+
+    def without(self, *names: str) -> Explanation:
+        """The explanation without some of its effects."""
+        kept = [(term, z) for term, z in self.by_term() if term.effect.name not in names]
         return Explanation(
             tuple(term for term, _ in kept), np.concatenate([np.zeros(0), *(z for _, z in kept)]), self.own
         )
@@ -205,12 +210,8 @@ class Simulator(abc.ABC):
     def with_own(self, one: Explanation) -> Explanation:
         """The explanation with a row of own numbers for each recording: 0 where it has none yet."""
         count = self.own(one)
-        if not count:
-            return one if not one.own.size else dataclasses.replace(one, own=np.zeros((0, 0)))
         kept = one.own if one.own.shape[1] == count else np.zeros((0, count))
-        more = 1 + max(self.recording) - len(kept)
-        if more <= 0 and kept is one.own:
-            return one
+        more = 1 + max(self.recording) - len(kept) if count else 0
         return dataclasses.replace(one, own=np.pad(kept, ((0, max(more, 0)), (0, 0))))
 
     @abc.abstractmethod
@@ -237,15 +238,14 @@ class Simulator(abc.ABC):
             For every explanation a prediction [e, T, ...] and its derivatives [P + M, e, T, ...]: by z, then by the
             M numbers that the episode's recording has for its own.
         """
-        asked, counts = [], []
+        asked, steps = [], []
         for one in explanations:
-            differences = np.concatenate([one.differences, np.full(one.own.shape[1], _OWN_DIFFERENCE)])
-            asked.append(one)
-            asked += [one.moved(one.z + step) for step in np.diag(one.differences)]
-            asked += [one.moved(one.z, one.own + step) for step in _OWN_DIFFERENCE * np.eye(one.own.shape[1])]
-            counts.append(differences)
+            count = one.own.shape[1]
+            asked += [one, *(one.moved(one.z + step) for step in np.diag(one.differences))]
+            asked += [one.moved(one.z, one.own + step) for step in _OWN_DIFFERENCE * np.eye(count)]
+            steps.append(np.concatenate([one.differences, np.full(count, _OWN_DIFFERENCE)]))
         predicted, result, begin = self.predict(asked, episodes), [], 0
-        for differences in counts:
+        for differences in steps:
             here, moved = predicted[begin], predicted[begin + 1 : begin + 1 + len(differences)]
             begin += 1 + len(differences)
             with np.errstate(invalid="ignore"):

@@ -16,7 +16,6 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.case import Case, first_shapes
 from cablejax.diagnose.diagnosis import CableDiagnosis, UnderLaw
 from cablejax.diagnose.recording import DiagnosisError
-from cablejax.types import GapLog
 
 
 class Reading(abc.ABC):
@@ -24,20 +23,18 @@ class Reading(abc.ABC):
 
     Attributes:
         assumes: in words, for a law of the simulator.
-        log: as this reading has it.
-        case: of that log; None where the simulator cannot follow it.
+        case: of the log as this reading has it; None where the simulator cannot follow it.
     """
 
     assumes: str
-    log: GapLog
     case: Case | None
 
     @abc.abstractmethod
     def caveat(self, probability: float) -> str:
         """What was assumed and why, with its probability among all laws."""
 
-    def told(self, diagnosis: CableDiagnosis, probability: float) -> CableDiagnosis:
-        """A diagnosis made with this reading, with a sentence that says so."""
+    def noted_in(self, diagnosis: CableDiagnosis, probability: float) -> CableDiagnosis:
+        """A diagnosis made with this reading, with a sentence and a caveat that say so."""
         return dataclasses.replace(
             diagnosis,
             sentence=f"{diagnosis.sentence} This assumes that {self.assumes}.",
@@ -60,12 +57,10 @@ class Held(Reading):
     """Cables that begin as they were first seen: the table holds them there, away from where they would settle.
 
     Attributes:
-        log: the same.
-        case: its cables not settled.
+        case: of the same log, its cables not settled.
         off: largest distance of a keypoint's first place from that of the settled nominal cable [m].
     """
 
-    log: GapLog
     case: Case
     off: float
 
@@ -80,12 +75,11 @@ class Held(Reading):
         )
 
 
-def held(case: Case, log: GapLog, calibration: Calibration) -> Held | None:
+def held(case: Case, calibration: Calibration) -> Held | None:
     """The reading that the table holds the cable at the start, if it lies noticeably away from the settled shape.
 
     Args:
         case: of the log, its cables settled.
-        log: that was read.
         calibration: of the judgement.
     """
     if case.simulator.playback.settling == 0:
@@ -99,7 +93,7 @@ def held(case: Case, log: GapLog, calibration: Calibration) -> Held | None:
     if max(float(np.sqrt(np.mean(one**2) / 2)) for one in off) <= smallest:
         return None
     try:
-        unsettled = Case.of(log, case.effects, settling=0.0)
+        unsettled = Case.of(case.log, case.effects, settling=0.0)
     except DiagnosisError:
         return None
-    return Held(log, unsettled, max(float(one.max()) for one in off))
+    return Held(unsettled, max(float(one.max()) for one in off))

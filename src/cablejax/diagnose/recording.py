@@ -53,6 +53,11 @@ class Recording:
     caveats: tuple[str, ...]
 
     @property
+    def valid(self) -> Bool[np.ndarray, "E T"]:
+        """Samples that are no padding."""
+        return np.arange(self.gripper_pose.shape[1])[None] < self.length[:, None]
+
+    @property
     def has_commands(self) -> bool:
         """Whether commands were logged; all zero while the grippers move means that they were not."""
         if not self.commanded.any():
@@ -64,8 +69,7 @@ class Recording:
     @property
     def recorded_pose(self) -> Float[np.ndarray, "E T 2 3"]:
         """The gripper poses, NaN beyond an episode's end."""
-        recorded = np.arange(self.gripper_pose.shape[1])[None] < np.asarray(self.length)[:, None]
-        return np.where(recorded[:, :, None, None], self.gripper_pose, np.nan)
+        return np.where(self.valid[:, :, None, None], self.gripper_pose, np.nan)
 
     def as_log(self, meta: dict[str, Any]) -> GapLog:
         """The log after repairs, without the padding."""
@@ -153,7 +157,7 @@ def prepare(log: GapLog) -> Recording:
         caveats=(),
     )
     caveats += _plausible(log, recording)
-    valid = (np.arange(total)[None] < recording.length[:, None]) & recording.commanded[:, None]
+    valid = recording.valid & recording.commanded[:, None]
     if recording.has_commands and (fault := command_fault(pose, command, recording.interval, valid)):
         raise DiagnosisError(fault)
     if log.hold is None or not hold.any():
@@ -213,8 +217,7 @@ def _whole_turns(points: Float[np.ndarray, "T N 2"], pose: Float[np.ndarray, "T 
 def _plausible(log: GapLog, recording: Recording) -> list[str]:
     """Refuses keypoints of another cable; reports what weakens the diagnosis."""
     points, caveats = recording.keypoints, []
-    seen = np.asarray(np.isfinite(points).all(axis=-1))
-    valid = np.arange(points.shape[1])[None] < recording.length[:, None]
+    seen, valid = np.asarray(np.isfinite(points).all(axis=-1)), recording.valid
     missing = 1 - seen[valid].mean()
     if missing > 0.9:
         raise DiagnosisError(

@@ -23,7 +23,7 @@ class Regimes:
     """Regimes of the samples.
 
     Attributes:
-        masks: by "what: class", shape [E, T] each; the classes of one "what" do not overlap.
+        masks: by "what: class", shape [E, T] each, those with samples; the classes of one "what" do not overlap.
         pairs: two regimes that are worth holding against each other, by the name of the first.
         hold: the grippers rest and the cable has settled, shape [E, T].
     """
@@ -85,10 +85,9 @@ def regimes_of(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], valid: Bool[n
         "speed: fast": (masks["speed: fast"], masks["speed: slow"]),
         "direction: grippers closing": (closing, opening),
         "reversal: after": (moving & late, moving & ~late),
+        "curvature: high": (masks["curvature: high"], masks["curvature: low"]),
+        "gripper distance: short": (masks["gripper distance: short"], masks["gripper distance: long"]),
     }
-    for name, other in (("curvature: high", "curvature: low"), ("gripper distance: short", "gripper distance: long")):
-        if name in masks and other in masks:
-            pairs[name] = masks[name], masks[other]
     return Regimes(masks={k: m for k, m in masks.items() if m.any()}, pairs=pairs, hold=hold)
 
 

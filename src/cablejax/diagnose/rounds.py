@@ -13,16 +13,15 @@ includes its prior, which makes the test cautious.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 from scipy.special import softmax
 from scipy.stats import chi2
 
-from cablejax.diagnose.belief import Calibration, effect_names, in_doubt
+from cablejax.diagnose.belief import effect_names
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
+from cablejax.diagnose.search import Search
 from cablejax.gaplog_join import recordings
 from cablejax.types import GapLog
 
@@ -76,17 +75,12 @@ class Rounds:
         return max(self.rounds, key=lambda one: one.own_gain)
 
 
-def rounds_of(
-    log: GapLog, fits: Sequence[Fit], scores: Float[np.ndarray, "F"], evidence: Evidence, calibration: Calibration
-) -> Rounds | None:
+def rounds_of(log: GapLog, found: Search) -> Rounds | None:
     """Contribution of each recording of a joined log; None for a log of one recording.
 
     Args:
         log: as `cablejax.gaplog_join.joined` makes it.
-        fits: of different sets of effects to all of it, best first.
-        scores: their log posterior.
-        evidence: that they were fitted to, of all episodes.
-        calibration: of the judgement.
+        found: explanations of all its episodes.
 
     Raises:
         GapLogError: what the log says of its recordings does not add up to its episodes.
@@ -94,18 +88,18 @@ def rounds_of(
     parts = recordings(log)
     if len(parts) < 2:
         return None
-    kept, _ = in_doubt(fits, scores, evidence, calibration)
+    evidence, (kept, _) = found.evidence, found.in_doubt()
     if len(kept) == 1:
         effects = len(kept[0].explanation.terms)
-        rejected = [fit for fit in fits if fit is not kept[0] and len(fit.explanation.terms) == effects]
+        rejected = [fit for fit in found.fits if fit is not kept[0] and len(fit.explanation.terms) == effects]
         kept = [kept[0], *rejected[:_REJECTED]]
     names = [" + ".join(effect_names(fit.explanation)) or "nominal" for fit in kept]
     each = np.stack([evidence.log_likelihoods(fit.held_out_sse(evidence)) for fit in kept])
-    score = {id(fit): value for fit, value in zip(fits, scores, strict=True)}
+    score = {id(fit): value for fit, value in zip(found.fits, found.scores, strict=True)}
     believed = np.array([score[id(fit)] for fit in kept]) - each.sum(axis=1)
     ends = np.cumsum([part["episodes"] for part in parts])
     rows = [np.arange(end - part["episodes"], end) for part, end in zip(parts, ends, strict=True)]
-    tested = next((fit for fit in [kept[0], *fits] if fit.explanation.terms), kept[0])
+    tested = next((fit for fit in [kept[0], *found.fits] if fit.explanation.terms), kept[0])
     gains = [_own_gain(tested, evidence, own) for own in rows]
     rounds = []
     for part, own, end, gain in zip(parts, rows, ends, gains, strict=True):

@@ -106,7 +106,6 @@ class Examined:
     """Common part of all diagnoses.
 
     Attributes:
-        evidence: that was explained.
         found: by the search.
         conclusion: from it.
         before, after: predictions without any effect, and by the best explanation; each episode from a fit that has
@@ -114,7 +113,6 @@ class Examined:
         gap: before and after.
     """
 
-    evidence: Evidence
     found: Search
     conclusion: Conclusion
     before: Float[np.ndarray, "E T *O"]
@@ -127,7 +125,7 @@ class Examined:
         return {name: getattr(self.conclusion, name) for name in shared} | {
             "sentence": sentence(self.conclusion, self.gap.shrinkage),
             "gap": self.gap,
-            "baselines": baselines(self.found, self.evidence),
+            "baselines": baselines(self.found),
         }
 
 
@@ -148,8 +146,7 @@ def examine(
     """
     found, conclusion = explain(evidence, calibration, progress=progress)
     progress("fitting without each episode in turn")
-    null = next(fit for fit in found.fits if not fit.explanation.terms)
-    before = evidence.nominal if null.refits is None else held_out_predictions(evidence, null)[0]
+    before = evidence.nominal if found.null.refits is None else held_out_predictions(evidence, found.null)[0]
     after, held_out = held_out_predictions(evidence, conclusion.best)
     seen = np.asarray(np.isfinite(evidence.observed).any(axis=tuple(range(2, evidence.observed.ndim))))
     gap = measure_gap(
@@ -161,7 +158,7 @@ def examine(
         held_out=held_out,
         resolvable=conclusion.verdict != "none",
     )
-    return Examined(evidence, found, conclusion, before, after, gap)
+    return Examined(found, conclusion, before, after, gap)
 
 
 def weighed(
@@ -209,10 +206,9 @@ def explain(
     if has_gap(null, evidence, calibration):
         found = search(evidence, null, calibration, progress=progress)
         progress("fitting by other laws")
-        laws = by_other_laws(found, evidence, calibration)
-    else:
-        found, laws = Search((null,), np.zeros(1), {}), ()
-    return found, conclude(found, evidence, calibration, laws)
+        return found, conclude(found, by_other_laws(found))
+    found = Search.of([null], evidence, calibration)
+    return found, conclude(found)
 
 
 def _null(evidence: Evidence) -> Fit:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.protocol import Explanation, explanation
+from cablejax.diagnose.protocol import Explanation
 from cablejax.effects.effect import Effect
 
 # How far a template is stretched, at most, to meet the gap.
@@ -47,9 +47,9 @@ def screen(
         effects: to try.
         predicted: by the base.
     """
-    begin, residual = _parts(base), evidence.observed - predicted
+    residual = evidence.observed - predicted
     starts = [
-        dataclasses.replace(explanation(*begin, (effect, variant, values)), own=base.own)
+        base.plus((effect, variant, values))
         for effect in effects
         for variant, values in evidence.simulator.starts(effect, predicted, residual)
     ]
@@ -70,10 +70,6 @@ def screen(
             else:
                 result.append(Template(stretched, product**2 / size / power, weighed))
     return result
-
-
-def _parts(base: Explanation) -> list[tuple[Effect, int, Sequence[float]]]:
-    return [(t.effect, t.variant, [float(x) for x in v]) for t, v in zip(base.terms, base.values(), strict=True)]
 
 
 def _stretch(start: Explanation, n_base: int, amplitude: float) -> Explanation | None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.belief import Calibration, best_by_effects, effect_names, excess, level, log_scores
+from cablejax.diagnose.belief import Calibration, as_good, best_by_effects, effect_names, excess, level, log_scores
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation
@@ -23,21 +23,67 @@ _WEIGHED_PARTNERS = 3
 _NEGLIGIBLE = 0.1
 # Of a set, an effect that repeats counted as often as it does: three keypoints off their places and another cause.
 _MOST_TERMS = 6
+# Each costs simulations of every motion that is considered.
+_MOST_IN_DOUBT = 5
 
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """All explanations that were fitted.
+    """All explanations that were fitted to a recording.
 
     Attributes:
-        fits: best first.
+        evidence: that was explained.
+        calibration: of the judgement.
+        fits: of different sets of effects, best first; one is the nominal simulator.
         scores: their log posterior, see `belief.log_scores`.
         screened: {effect: share of the squared gap that its best template takes away}.
     """
 
+    evidence: Evidence
+    calibration: Calibration
     fits: tuple[Fit, ...]
     scores: Float[np.ndarray, "F"]
-    screened: dict[str, float]
+    screened: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, fits: Sequence[Fit], evidence: Evidence, calibration: Calibration, screened: dict[str, float] | None = None
+    ) -> Search:
+        """Scores fits, and sorts them."""
+        scores = log_scores(fits, evidence, calibration)
+        best_first = np.argsort(-scores, kind="stable")
+        return cls(evidence, calibration, tuple(fits[i] for i in best_first), scores[best_first], screened or {})
+
+    @property
+    def null(self) -> Fit:
+        """The nominal simulator."""
+        return next(fit for fit in self.fits if not fit.explanation.terms)
+
+    @property
+    def singles(self) -> list[int]:
+        """Indices of the fits of one effect."""
+        return [i for i, fit in enumerate(self.fits) if len(effect_names(fit.explanation)) == 1]
+
+    def in_doubt(self) -> tuple[list[Fit], Float[np.ndarray, "K"]]:
+        """Explanations that a verdict leaves open, and their probabilities, sum 1.
+
+        Those whose odds against the best are not small. One with another effect in the place of one of the best's that
+        merely leaves as little counts as if its odds were the smallest of these: a likelihood is that sure only if
+        every law is exact.
+        """
+        best, least = self.fits[0], self.calibration.set_odds
+        names, kept, odds = set(effect_names(best.explanation)), [], []
+        for fit, chance in zip(self.fits, np.exp(self.scores - self.scores[0]).tolist(), strict=True):
+            own = set(effect_names(fit.explanation))
+            in_place = len(own) == len(names) and len(own & names) >= len(names) - 1
+            if chance < least and in_place and as_good(fit, best, self.evidence, self.calibration):
+                chance = least
+            if chance >= least:
+                kept.append(fit)
+                odds.append(chance)
+        order = np.argsort(-np.array(odds), kind="stable")[:_MOST_IN_DOUBT]
+        chances = np.array(odds)[order]
+        return [kept[i] for i in order], chances / chances.sum()
 
 
 def search(
@@ -100,15 +146,15 @@ def search(
         fits = _joined(fits, exchanged, evidence, calibration)
         if fits[0].explanation is not before:
             fits = grow(fits, fits[:1])
-    return Search(tuple(fits), log_scores(fits, evidence, calibration), screened)
+    return Search.of(fits, evidence, calibration, screened)
 
 
-def baselines(found: Search, evidence: Evidence) -> dict[str, str]:
+def baselines(found: Search) -> dict[str, str]:
     """Effects that simpler rules would have named, see `Diagnosis.baselines`."""
-    singles = [fit for fit in found.fits if len(effect_names(fit.explanation)) == 1]
+    singles = [found.fits[i] for i in found.singles]
     if not singles:
         return {}
-    samples = float(evidence.count.sum())
+    samples = float(found.evidence.count.sum())
 
     def bic(fit: Fit) -> float:
         return float(fit.sse.sum()) + len(fit.explanation.z) * float(np.log(samples))

@@ -127,7 +127,7 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         keypoint_p=exceedance_p(squared.reshape(-1, squared.shape[-1]).T, inflation),
         heat=np.sqrt(squared),
         horizons_mm=_horizons(log, valid, size),
-        regimes={name: size(mask[..., None]) for name, mask in regimes.masks.items() if mask.any()},
+        regimes={name: size(mask[..., None]) for name, mask in regimes.masks.items()},
         frames=_frames(residual, noise, nominal),
         contrasts=_contrasts(squares, noise, size, regimes, motion, arclength),
         regime_masks=regimes.masks,

@@ -13,31 +13,30 @@ from cablejax.effects.effect import Parameter
 _CENTRES = (0.08, 0.2, 0.32, 0.44, 0.56, 0.68, 0.8, 0.92)
 _CENTRE = Parameter("centre", "", 0.0, 1.0, 0.5, 0.3)
 _WIDTH = Parameter("width", "", 0.03, 1.0, 0.25, 0.7, log=True)
+# Parameters that are shares of the cable's length, which a verdict has in metres.
+_SHARES = (_CENTRE.name, _WIDTH.name)
 
 
-class _Section(CableEffect):
-    """An effect on a section of the cable; its first two parameters are centre and width over the cable's length."""
-
-    amplitude, reversible = 2, True
+class _Local(CableEffect):
+    """An effect at a place on the cable, or on a section of it."""
 
     def reported(self, values, variant, config):
-        """Centre and width of the section in metres, then the last parameter in its own unit."""
-        last = self.parameters[2]
-        return {
-            "centre_m": (float(values[0]) * config.cable.length, "m"),
-            "width_m": (float(values[1]) * config.cable.length, "m"),
-            last.name: (float(values[2]), last.unit),
-        }
+        """Centre and width in metres, the other parameters in their own units."""
+        length, reported = config.cable.length, {}
+        for p, value in zip(self.parameters, values, strict=True):
+            name, factor, unit = (f"{p.name}_m", length, "m") if p.name in _SHARES else (p.name, 1.0, p.unit)
+            reported[name] = float(value) * factor, unit
+        return reported
 
     def _from_reported(self, parameters, config):
-        length = config.cable.length
-        shares = {name.removesuffix("_m"): value / length for name, value in parameters.items()}
-        return parameters | {name: shares[name] for name in ("centre", "width") if name in shares}
+        given = {name: parameters[f"{name}_m"] / config.cable.length for name in _SHARES if f"{name}_m" in parameters}
+        return parameters | given
 
     def location(self, values, variant, config):
-        """The section's two ends along the cable [m]."""
-        centre, width = float(values[0]) * config.cable.length, float(values[1]) * config.cable.length
-        return {"along_cable_m": [max(centre - width / 2, 0.0), min(centre + width / 2, config.cable.length)]}
+        """The section's two ends along the cable [m], which are one for a place."""
+        reported = self.reported(values, variant, config)
+        centre, half = reported["centre_m"][0], reported.get("width_m", (0.0, "m"))[0] / 2
+        return {"along_cable_m": [max(centre - half, 0.0), min(centre + half, config.cable.length)]}
 
 
 class BendingStiffness(CableEffect):
@@ -59,13 +58,14 @@ class BendingStiffness(CableEffect):
         return [(0, (ratio,)) for ratio in (0.1, 0.2, 0.4, 2.5, 5.0)]
 
 
-class StiffnessProfile(_Section):
+class StiffnessProfile(_Local):
     """EI differs over part of the cable."""
 
     name = "stiffness_profile"
     hook = "bending"
     parameters = (_CENTRE, _WIDTH, Parameter("ratio", "", 0.05, 30.0, 1.0, 1.0, log=True))
     null = (0.5, 0.25, 1.0)
+    amplitude, reversible = 2, True
 
     def apply(self, physics, values, variant, config):
         """Multiplies EI of the joints in the section by the ratio."""
@@ -80,13 +80,14 @@ class StiffnessProfile(_Section):
         return [(0, (c, 0.2, 0.5)) for c in _CENTRES] + [(0, (c, 0.1, 3.0)) for c in (0.0, 1.0)]
 
 
-class IntrinsicCurvature(_Section):
+class IntrinsicCurvature(_Local):
     """The rest shape is curved, over part of the cable or all of it."""
 
     name = "intrinsic_curvature"
     hook = "bending"
     parameters = (_CENTRE, _WIDTH, Parameter("curvature_per_m", "1/m", -30.0, 30.0, 0.0, 3.0))
     null = (0.5, 0.25, 0.0)
+    amplitude, reversible = 2, True
 
     def apply(self, physics, values, variant, config):
         """Adds to the rest curvature of the joints in the section [1/m]."""
@@ -216,7 +217,7 @@ class LinearDensity(CableEffect):
         return [(0, (ratio,)) for ratio in (0.2, 0.5, 2.0, 5.0, 10.0)]
 
 
-class LumpedMass(CableEffect):
+class LumpedMass(_Local):
     """A connector or clip."""
 
     name = "lumped_mass"
@@ -234,15 +235,3 @@ class LumpedMass(CableEffect):
     def starts(self, context):
         """A mass of 30 g at eight places along the cable."""
         return [(0, (c, 0.03)) for c in _CENTRES]
-
-    def reported(self, values, variant, config):
-        """The place along the cable [m] and the mass [kg]."""
-        return {"centre_m": (float(values[0]) * config.cable.length, "m"), "mass_kg": (float(values[1]), "kg")}
-
-    def _from_reported(self, parameters, config):
-        return {"centre": parameters["centre_m"] / config.cable.length, "mass_kg": parameters["mass_kg"]}
-
-    def location(self, values, variant, config):
-        """The place along the cable [m], as a section without length."""
-        s = float(values[0]) * config.cable.length
-        return {"along_cable_m": [s, s]}

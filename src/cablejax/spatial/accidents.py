@@ -60,10 +60,10 @@ def accident_sentences(
         coarse: those that were simulated with larger errors of the time steps than these may have.
     """
     result, torn = [], windows.torn
-    few = kept(lost | off(error) | torn)
+    accidents = lost | off(error) | torn
     treated = (
         "They have little weight in fits, and are excluded from the gap and from comparisons."
-        if not few[lost | off(error) | torn].any()
+        if not kept(accidents)[accidents].any()
         else "They are too many to be excluded, so they count in all figures."
     )
     look = "Check them for jerks of the grippers and jumps of keypoints."

@@ -85,10 +85,17 @@ class SpatialCable(Simulator):
         """The same cable in other windows, without correction."""
         return dataclasses.replace(self, windows=windows, correction=None)
 
+    def chosen(self, index) -> SpatialCable:
+        """The same cable in some of the windows, without correction."""
+        return self.on(self.windows.chosen(index))
+
+    def some(self, count: int) -> SpatialCable:
+        """The same cable in at most so many windows, see `Windows.whole`, without correction."""
+        return self.chosen(self.windows.whole(count))
+
     def trusting(self, error: Float[np.ndarray, "W"]) -> SpatialCable:
         """The same cable and windows, with less weight in fits for windows that are off by their errors [m]."""
-        before = 1.0 if self.windows.trust is None else self.windows.trust
-        return self.on(dataclasses.replace(self.windows, trust=before * trust(error)))
+        return self.on(dataclasses.replace(self.windows, trust=self.windows.trust * trust(error)))
 
     def finer(self, factor: int) -> SpatialCable:
         """The same cable with time steps that are so many times shorter, including those in fast motion."""
@@ -130,16 +137,15 @@ class SpatialCable(Simulator):
         """Free markers at every sample [m]; NaN from where on the simulation was not solved."""
         return self.rollouts(one)[0]
 
-    def rollouts(self, one: Explanation) -> tuple[Float[np.ndarray, "W T F 3"], Int[np.ndarray, "W"]]:
-        """The free markers of `motion`, and the `RodResult` of each window."""
-        parts = self._in_parallel(0, one, np.arange(len(self.windows)), ())
+    def rollouts(self, one: Explanation, episodes=None) -> tuple[Float[np.ndarray, "E T F 3"], Int[np.ndarray, "E"]]:
+        """The free markers of `motion`, and the `RodResult` of each window; `episodes` are windows, None = all."""
+        parts = self._in_parallel(one, np.arange(len(self.windows)) if episodes is None else episodes)
         points, results = zip(*parts, strict=True)
         return np.concatenate(points), np.concatenate(results)
 
     def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T F 3"]:
         """Free markers [m] at the samples that are compared; NaN from where on the simulation was not solved."""
-        parts = ((self._in_parallel(0, one, episodes, ())) for one in explanations)
-        found = np.stack([np.concatenate([points for points, _ in part])[:, FITTED] for part in parts])
+        found = np.stack([self.rollouts(one, episodes)[0][:, FITTED] for one in explanations])
         return found if self.correction is None else found + self.correction[episodes]
 
     def linearise(self, explanations, episodes):
@@ -166,7 +172,7 @@ class SpatialCable(Simulator):
         count = len(directions)
         rows = np.zeros((max(_COLUMNS * -(-count // _COLUMNS), _COLUMNS), self.layout.size))
         rows[:count] = directions
-        parts = self._in_parallel(1, one, episodes, (rows,))
+        parts = self._in_parallel(one, episodes, rows)
         predicted = np.concatenate([part[0] for part in parts])[:, FITTED]
         slopes = np.concatenate([part[1][:, :, FITTED] for part in parts])
         return predicted, np.moveaxis(slopes, 1, 0)[:count]
@@ -181,17 +187,21 @@ class SpatialCable(Simulator):
             observed=windows.observed[:, FITTED],
             nominal=np.zeros_like(windows.keypoints[:, FITTED]),
             noise=np.full((windows.keypoints.shape[2], 1), unit),
-            temper=np.ones(len(windows)) if windows.trust is None else 1 / windows.trust,
+            temper=1 / windows.trust,
             freedom=LEAST_SQUARES,
             motion=np.arange(len(windows)),
             robust=_ROBUST,
         )
 
-    def _in_parallel(self, which: int, one: Explanation, episodes, more: tuple):
-        """Batches of one size, so that one compilation serves, by as many threads as there are cores."""
+    def _in_parallel(self, one: Explanation, episodes, directions: Float[np.ndarray, "K P"] | None = None):
+        """Batches of one size, so that one compilation serves, by as many threads as there are cores.
+
+        Of each batch the free markers and the `RodResult`s, or with `directions` the markers and their derivatives.
+        """
         rod = dataclasses.replace(self.rod, twisting=TWISTED in one.names)
-        run, windows = _compiled(rod, self.layout, self.windows.interval)[which], self.windows.chosen(episodes)
-        values = self._values(one, episodes)
+        simulate, differentiate = _compiled(rod, self.layout, self.windows.interval)
+        run, more = (simulate, ()) if directions is None else (differentiate, (directions,))
+        windows, values = self.windows.chosen(episodes), self._values(one, episodes)
         # one rollout's operations are too small to share; a window alone is not worth a batch
         size = _CHUNK if len(windows) > 1 else 1
 
@@ -270,8 +280,7 @@ def _compiled(rod: Rod, layout: Layout, interval: float):
         def tangent(direction):
             return jax.jvp(lambda v: batch(v, *inputs)[0], (values,), (jnp.broadcast_to(direction, values.shape),))
 
-        predicted, derivative = jax.vmap(tangent, out_axes=(None, 1))(directions)
-        return predicted, derivative
+        return jax.vmap(tangent, out_axes=(None, 1))(directions)
 
     options = compiler_options()
     return _double(jax.jit(batch, compiler_options=options)), _double(jax.jit(both, compiler_options=options))

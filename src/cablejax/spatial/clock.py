@@ -75,9 +75,9 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     if repairs:
         log = dataclasses.replace(log, gripper_pose=pose)
     steps = log.intervals
-    interval = float(np.median(steps)) if len(steps) else 0.0
     if not len(steps):
         return log, tuple(repairs)
+    interval = float(np.median(steps))
     rates = [(time[n - 1] - time[0]) / (n - 1) for time, n in zip(log.time, log.episode_length, strict=True) if n > 1]
     same = np.abs(np.array(rates) - interval).max() <= _SAME_RATE * interval
     if same and np.abs(steps - interval).max() <= _EVEN * interval:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import pathlib
 import time
 from collections.abc import Callable, Sequence
@@ -28,7 +27,6 @@ from cablejax.spatial.gap import (
     constant_offset,
     gap_of,
     in_log,
-    noise_of,
     own_error,
     smallest_gap,
     squares,
@@ -90,13 +88,13 @@ def diagnose_space(
     changes = local_changes(log, windows.held)
     for change in changes:
         progress(change)
-    noise = noise_of(windows)
+    noise = windows.noise
     found = identify(windows, stiffness, cable["bending_damping_s"], only=only, state=state, progress=progress)
     effects, edges = named_effects(found, density), found.cable.rod.n_edges
     named = [effect.name for effect in effects]
     before, (after, results) = found.cable.motion(explanation()), found.unseen(with_both_drags(named))
     lost, error, use = _simulated(after, windows)
-    kept_windows = found.cable.on(windows.chosen(use))
+    kept_windows = found.cable.chosen(use)
     smallest = smallest_gap(noise, windows, own := own_error(kept_windows, before[use], noise))
     gap = gap_of(before[use], after[use], kept_windows, noise, smallest)
     equivalent = _equivalent(found, named)
@@ -192,24 +190,21 @@ def _verdict(gap: Gap, smallest_mm: float, named: Sequence[str], equivalent: tup
 
 def _equivalent(found: Identified, named: Sequence[str]) -> tuple[tuple[str, ...], ...]:
     """Rest curvature and a stiffness profile that take each other's place equally well."""
-    swap = next((s for s in found.steps if s.effect == "intrinsic_curvature for stiffness_profile"), None)
-    kept = [s for s in found.steps if s.accepted and s.effect != "intrinsic_curvature"]
-    if swap is None or swap.accepted or not kept or swap.chance < 0.05:
+    swap = next((step for step in found.steps if step.instead_of), None)
+    if swap is None or swap.accepted or swap.chance < 0.05 or swap.instead_of not in named:
         return ()
-    return (("stiffness_profile", "intrinsic_curvature"),) if "stiffness_profile" in named else ()
+    return ((swap.instead_of, swap.effect),)
 
 
 def _ranking(found: Identified) -> tuple[Ranked, ...]:
     """Every trial in order, by the share of the nominal error that went when it came in, on unseen recordings."""
     nominal, before, ranked = moderated(found.steps[0].error), moderated(found.steps[0].error), []
-    for last, step in itertools.pairwise(found.steps):
-        if np.array_equal(last.error, step.error) and last.accepted:
-            continue  # a second name of the same step
+    for step in found.steps[1:]:
         error = moderated(step.error)
         gain = float((before**2).mean() - (error**2).mean()) / float((nominal**2).mean())
         outcome = "kept" if step.accepted else "did not help" if step.counts else "not judged"
         # the share of resamples in which the error falls is no probability that the effect is there
-        ranked.append(Ranked(step.effect.split(" ")[0], None, gain, 1e3 * float(error.mean()), outcome))
+        ranked.append(Ranked(step.effect, None, gain, 1e3 * float(error.mean()), outcome))
         before = error if step.accepted else before
     return tuple(ranked)
 

@@ -24,7 +24,7 @@ from scipy.stats import norm, t
 from cablejax.bounded import Result, solve_arrow
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
-from cablejax.diagnose.protocol import Explanation, explanation
+from cablejax.diagnose.protocol import Explanation
 from cablejax.spatial.cable import TWISTED, SpatialCable, typical_error
 from cablejax.spatial.effects import Layout
 
@@ -168,10 +168,15 @@ def estimate(
         tried: names of the effects that are free.
         progress: called with a line of text.
     """
-    starts = [_with_all(start, cable, tried) for start in starts]
+    free = [effect for effect in cable.layout.effects if effect.name in tried]
+    # what a start lacks is where its prior has it
+    starts = [
+        start.plus(*((e, 0, [p.centre for p in e.parameters]) for e in free if e.name not in start.names))
+        for start in starts
+    ]
     if TWISTED in tried:
         # four times the cost
-        cable = cable.on(cable.windows.chosen(cable.windows.whole(_TWISTED_WINDOWS)))
+        cable = cable.some(_TWISTED_WINDOWS)
     progress(f"all effects free: {len(cable.windows)} windows")
     tolerance, rounds, steps = _TOLERANCE * len(cable.windows), 0, _STEPS
     start, before = starts[0], np.inf
@@ -219,13 +224,6 @@ def starts_from(one: Explanation, other: Explanation) -> list[Explanation]:
     found = (both[0] != 0).astype(int) + (both[1] != 0)
     own = (both[0] + both[1]) / np.maximum(found, 1)
     return [one.moved(z, own) for z in ((one.z + other.z) / 2, one.z, other.z)]
-
-
-def _with_all(start: Explanation, cable: SpatialCable, tried: Sequence[str]) -> Explanation:
-    """With the effects that it lacks as they are where nothing is known of them."""
-    more = [effect for effect in cable.layout.effects if effect.name in tried and effect.name not in start.names]
-    added = explanation(*((effect, 0, [p.centre for p in effect.parameters]) for effect in more))
-    return cable.with_own(Explanation((*start.terms, *added.terms), np.append(start.z, added.z), start.own))
 
 
 def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:

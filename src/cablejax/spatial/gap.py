@@ -13,7 +13,6 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.gap import measure_gap
-from cablejax.diagnose.noise import noise_floor
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.where import HORIZONS, Where, above, sizes_of
 from cablejax.gaplog import labels
@@ -29,11 +28,6 @@ SURE_OF_OWN = 1.5
 
 OWN = Calibration().smallest_gap(0.0)
 """Nor is one that the simulator may have by itself [m], of a cable of up to a metre: as on a table."""
-
-
-def noise_of(windows: Windows) -> float:
-    """Standard deviation of a coordinate [m], from fourth differences in time, which no motion of a cable has."""
-    return float(np.sqrt((noise_floor(windows.observed, None, order=4).std ** 2).mean()))
 
 
 def smallest_gap(noise: float, windows: Windows, own: float = 0.0) -> float:
@@ -88,9 +82,15 @@ def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -
 
 def squares(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[np.ndarray, "W T F 3"]:
     """Squared errors of free coordinates, bounded by a metre, NaN where nothing was recorded."""
+    observed = _compared(windows)
+    return np.where(np.isfinite(observed), bounded(predicted - observed) ** 2, np.nan)
+
+
+def _compared(windows: Windows) -> Float[np.ndarray, "W T F 3"]:
+    """The observed keypoints, NaN in the two samples that a simulation begins from."""
     observed = windows.observed
     observed[:, :2] = np.nan
-    return np.where(np.isfinite(observed), bounded(predicted - observed) ** 2, np.nan)
+    return observed
 
 
 def gap_of(
@@ -110,8 +110,7 @@ def gap_of(
         smallest: error from which on there is a gap [m], see `smallest_gap`.
     """
     windows = cable.windows
-    observed = windows.observed
-    observed[:, :2] = np.nan
+    observed = _compared(windows)
     evidence = Evidence(
         simulator=cable,
         episodes=np.arange(len(windows)),
@@ -169,6 +168,10 @@ def where_of(
     squared = squares(before, windows)
     speed = np.linalg.norm(np.diff(windows.position, axis=1, prepend=windows.position[:, :1]), axis=-1).max(axis=2)
     fast = (speed > np.median(speed[windows.valid]))[..., None, None]
+    sizes = {
+        "speed: fast": float(above(np.where(fast, squared, np.nan), noise)),
+        "speed: slow": float(above(np.where(fast, np.nan, squared), noise)),
+    }
     return sizes_of(
         off,
         noise,
@@ -177,10 +180,8 @@ def where_of(
         names=[f"file {name}" for name in labels(log, "file", "take")],
         gap_mm=float(above(squared, noise)),
         horizons_mm=_by_time(squared, windows.interval, noise),
-        regimes={
-            "speed: fast": float(above(np.where(fast, squared, np.nan), noise)),
-            "speed: slow": float(above(np.where(fast, np.nan, squared), noise)),
-        },
+        # grippers that rest all the time are never fast
+        regimes={name: size for name, size in sizes.items() if np.isfinite(size)},
         first=changes,
     )
 

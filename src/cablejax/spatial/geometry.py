@@ -34,10 +34,11 @@ def local_changes(log: GapLog, held: tuple[int, int]) -> tuple[str, ...]:
             continue
         usual = np.nanmedian(column)
         scatter = 1.4826 * np.nanmedian(np.abs(column - usual))
-        least = _SMALLEST if gripper is not None else _SMALLEST_FREE
+        if gripper is None:
+            least, where, why = _SMALLEST_FREE, "on the free cable", "a marker has moved, or the cable between them"
+        else:
+            least, where, why = _SMALLEST, f"at gripper {gripper}", "it was gripped again"
         odd = np.flatnonzero(np.abs(column - usual) > max(_SCATTERS * scatter, least))
-        where = f"at gripper {gripper}" if gripper is not None else "on the free cable"
-        why = "it was gripped again" if gripper is not None else "a marker has moved, or the cable between them"
         for sign in (-1, 1):
             part = odd[np.sign(column[odd] - usual) == sign]
             if len(part):

@@ -22,16 +22,17 @@ from scipy.special import softmax
 from scipy.stats import norm, t
 
 from cablejax.diagnose.belief import LEAST_SQUARES, Calibration, log_scores
-from cablejax.diagnose.diagnosis import PLACES, Diagnosis
+from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.given_arrays import checked_nominal
 from cablejax.diagnose.noise import noise_floor
-from cablejax.diagnose.protocol import Explanation, Plan, Report, Simulator, Term, in_batches
+from cablejax.diagnose.protocol import Explanation, Plan, Report, Simulator, in_batches
 from cablejax.diagnose.refits import refitted
 from cablejax.diagnose.run import Examined, examine, settings_of, weighed
+from cablejax.diagnose.search import Search
 from cablejax.diagnose.verdict_json import verdict_json
 from cablejax.diagnose.where import sizes_of
-from cablejax.spatial.hanging_effects import CLAMP_ANGLE, EFFECTS, wire_shape
+from cablejax.spatial.hanging_effects import CLAMP_ANGLE, EFFECTS, PARAMETERS, wire_shape
 
 LINKS_PER_SPACING = 2
 """Links of the model from one traced point to the next."""
@@ -77,7 +78,6 @@ class Photographs:
                 f"Along its traced points the wire measures {longest:.4g} m, expected its length, {self.length:g} m: "
                 "check the scale of the photographs."
             )
-
         if not self.error < _RIG * self.length:
             raise ValueError(
                 f"Photographs.error is {self.error:.3g} m, expected less than {_RIG:.0%} of the wire's length, "
@@ -134,10 +134,9 @@ class HangingWire(Simulator):
 
     def linearise(self, explanations, episodes):
         """By the implicit function theorem, exact."""
-        result, sizes = [], [len(effect.parameters) for effect in self.effects]
-        ends = dict(zip((e.name for e in self.effects), np.cumsum([0, *sizes[:-1]]), strict=True))
+        result, owner = [], np.array([effect.name for effect in self.effects for _ in effect.parameters])
         for one, found in zip(explanations, self._run(explanations, episodes), strict=True):
-            columns = [ends[term.effect.name] + k for term in one.terms for k in range(term.size)]
+            columns = [column for name in one.names for column in np.flatnonzero(owner == name)]
             slopes = np.moveaxis(found[:, 1:], 1, 0)[[*columns, -2, -1]]
             result.append((found[:, :1], slopes[:, :, None]))
         return result
@@ -150,15 +149,13 @@ class HangingWire(Simulator):
             name, unit = (f"{parameter.name}_m", "m") if along else (parameter.name, parameter.unit)
             parameters[name] = float(np.clip(value, parameter.low, parameter.high)) * (length if along else 1), unit
         if "width_m" not in parameters:
-            return Report(parameters, dict.fromkeys(PLACES))
+            return Report(parameters, {})
         centre, half = parameters["centre_m"][0], parameters["width_m"][0] / 2
-        return Report(
-            parameters, dict.fromkeys(PLACES) | {"along_cable_m": [max(centre - half, 0.0), min(centre + half, length)]}
-        )
+        return Report(parameters, {"along_cable_m": [max(centre - half, 0.0), min(centre + half, length)]})
 
     def _run(self, explanations: Sequence[Explanation], episodes) -> Float[np.ndarray, "X E 11 N 2"]:
         """Points, and their derivatives by the coordinates of all effects and by what the photograph has of its own."""
-        count = sum(len(effect.parameters) for effect in self.effects)
+        count = len(PARAMETERS)
         z = np.zeros((len(explanations), len(episodes), count + 2))
         for row, one in zip(z, explanations, strict=True):
             present = {term.effect.name: part for term, part in one.by_term()}
@@ -231,7 +228,7 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
         where=where,
         seconds=time.perf_counter() - begun,
         settings=settings_of(wire, calibration),
-        stiffness=_stiffness(examined, calibration),
+        stiffness=_stiffness(examined.found),
         examined=examined,
     )
 
@@ -264,26 +261,25 @@ def wire_verdict_json(diagnosis: WireDiagnosis) -> dict[str, Any]:
     return {**verdict_json(diagnosis), "stiffness_ratio": {"value": value, "ci90": interval, "unit": ""}}
 
 
-def _stiffness(examined: Examined, calibration: Calibration) -> tuple[float, float, float]:
+def _stiffness(found: Search) -> tuple[float, float, float]:
     """Median and 90 % interval of the ratio of EI, over the explanations that fit it."""
-    evidence, effect = examined.evidence, EFFECTS[0]
-    fits = [fit for fit in examined.found.fits if effect.name in fit.explanation.names]
-    best = examined.found.fits[0].explanation
+    evidence, effect = found.evidence, EFFECTS[0]
+    fits = [fit for fit in found.fits if effect.name in fit.explanation.names]
+    best = found.fits[0].explanation
     if not any({*best.names, effect.name} == set(fit.explanation.names) for fit in fits):
         # a search ends where an explanation is adequate; EI is of interest all the same
-        both = Explanation((*best.terms, Term(effect, 0)), np.append(best.z, 0.0), best.own)
+        both = best.plus((effect, 0, effect.null))
         fits += refitted(evidence, improve(evidence, evaluate(evidence, [both]), evidence.simulator.plan.last_steps))
-    parts = list(zip(fits, softmax(log_scores(fits, evidence, calibration)), strict=True))
-    weights = np.array([chance for _, chance in parts]) / sum(chance for _, chance in parts)
-    centres, spreads = np.array([_centre_and_spread(fit, evidence) for fit, _ in parts]).T
+    weights = softmax(log_scores(fits, evidence, found.calibration))
+    centres, spreads = np.array([_centre_and_spread(fit, evidence) for fit in fits]).T
 
     def missing(z, share):
         return float((weights * norm.cdf(z, centres, spreads)).sum()) - share
 
     reach = 20 * spreads.max() + np.ptp(centres)
     ends = centres.min() - reach, centres.max() + reach
-    found = [brentq(functools.partial(missing, share=share), *ends) for share in (0.5, 1 - _TAIL, _TAIL)]
-    middle, low, high = (float(effect.parameters[0].value(np.asarray(z))) for z in found)
+    quantiles = [brentq(functools.partial(missing, share=share), *ends) for share in (0.5, 1 - _TAIL, _TAIL)]
+    middle, low, high = (float(effect.parameters[0].value(np.asarray(z))) for z in quantiles)
     return middle, low, high
 
 

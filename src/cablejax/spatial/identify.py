@@ -27,7 +27,7 @@ from cablejax.spatial.cable import GOOD_FIT, TWISTED, SpatialCable, bounded
 from cablejax.spatial.effects import Layout, effect_names, effects_of
 from cablejax.spatial.estimate import Estimate, best_start, estimate, restarts
 from cablejax.spatial.memory import Memory, fingerprint
-from cablejax.spatial.search import Step, accepted_effects, halves, search, tried_with, unseen_error, with_effect
+from cablejax.spatial.search import Step, accepted_effects, halves, search, tried_with, unseen_error
 from cablejax.spatial.windows import Windows
 
 EDGES = 20
@@ -102,9 +102,8 @@ class Identified:
 
         def simulated(half):
             one = half.explanation
-            for name in set(one.names) - set(one.names if effects is None else effects):
-                one = one.without(name)
-            return self.cable.rollouts(one)
+            left_out = set(one.names) - set(one.names if effects is None else effects)
+            return self.cable.rollouts(one.without(*left_out))
 
         (one, ended), (other, other_ended) = map(simulated, self.halves)
         return np.where(self.first[:, None, None, None], other, one), np.where(self.first, other_ended, ended)
@@ -148,13 +147,13 @@ def identify(
     names = [name for name in effect_names() if (name != TWISTED if only is None else name in only)]
     layout = layout_of(windows, nominal_stiffness, nominal_damping)
     cable = SpatialCable(Rod(EDGES, 1, twisting=False), layout, windows)
-    time_steps = time_steps_for(cable.on(windows.chosen(windows.whole(_TIMED))))
+    time_steps = time_steps_for(cable.some(_TIMED))
     progress(
         f"time steps of {1e3 * windows.interval / time_steps.substeps:.3g} ms; half of that changes the motion by "
         f"{1e3 * time_steps.error:.1f} mm"
     )
     cable = cable.finer(time_steps.substeps)
-    picked = cable.on(windows.chosen(windows.whole(_SEARCHED)))
+    picked = cable.some(_SEARCHED)
     memory = Memory(state, fingerprint(cable, names), layout)
     steps = search(
         picked,
@@ -188,11 +187,11 @@ def identify(
 
 def _estimates(cable: SpatialCable, first, begun, tried, memory: Memory, progress) -> list[Estimate]:
     """Of either half of the recordings, from the fits of the search, and of all."""
-    windows, done = cable.windows, memory.done("estimates")
-    parts = ((first, "one half"), (~first, "the other half"), (np.ones(len(windows), bool), "all recordings"))
+    done = memory.done("estimates")
+    parts = ((first, "one half"), (~first, "the other half"), (np.ones(len(first), bool), "all recordings"))
     for part, word in parts[len(done) :]:
         progress(f"fitting {word}")
-        own = cable.on(windows.chosen(np.flatnonzero(part)))
+        own = cable.chosen(np.flatnonzero(part))
         if len(done) < 2:
             starts = restarts(begun[len(done)])
         else:
@@ -208,7 +207,7 @@ def _for_predictions(cable: SpatialCable, one: Explanation) -> SpatialCable:
     Values that were fitted with a correction are off by what it took out where predictions have the longer steps of
     the fit, which matters where few samples are a second.
     """
-    some = cable.on(cable.windows.chosen(cable.windows.whole(_TIMED)))
+    some = cable.some(_TIMED)
     motion, seen = some.exact().motion(one), some.windows.observed
     left = np.nanmean(bounded(motion - seen)[np.isfinite(seen)] ** 2)
     for finer in (1, 2):
@@ -220,24 +219,14 @@ def _for_predictions(cable: SpatialCable, one: Explanation) -> SpatialCable:
 
 def _twisted(cable: SpatialCable, steps: Sequence[Step], progress) -> list[Step]:
     """Rest curvature on top of what was found, and in place of a stiffness profile, its look-alike."""
-    before = [step for step in steps if step.accepted][-1]
-    variants = {TWISTED: before.halves}
-    if _RIVAL in before.halves[0].names:
-        variants[f"{TWISTED} for {_RIVAL}"] = (before.halves[0].without(_RIVAL), before.halves[1].without(_RIVAL))
+    before, effect = [step for step in steps if step.accepted][-1], cable.layout.named(TWISTED)
     trials = []
-    for name, bases in variants.items():
-        effect = cable.layout.named(TWISTED)
-        one, other = (with_effect(cable, base, effect, effect.null) for base in bases)
-        trials.append(tried_with(cable, name, (one, other), before, progress))
+    for rival in ("", _RIVAL) if _RIVAL in before.halves[0].names else ("",):
+        one, other = (base.without(rival).plus((effect, 0, effect.null)) for base in before.halves)
+        trials.append(tried_with(cable, TWISTED, (one, other), before, progress, rival))
     best = min((t for t in trials if t.accepted), key=lambda t: moderated(t.error).mean(), default=None)
     # the better one of the two stays, and comes last
-    result = [dataclasses.replace(t, accepted=False) for t in trials if t is not best]
-    if best is not None:
-        result.append(best)
-        if best.effect != TWISTED:
-            # both names: what went out, and what came in
-            result.append(dataclasses.replace(best, effect=TWISTED))
-    return result
+    return sorted((dataclasses.replace(t, accepted=t is best) for t in trials), key=lambda t: t.accepted)
 
 
 def time_steps_for(cable: SpatialCable) -> TimeSteps:

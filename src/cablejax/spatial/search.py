@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 from cablejax.bounded import solve_arrow
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate, improve
-from cablejax.diagnose.protocol import Explanation, Simulator, Term, explanation
+from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.diagnose.refits import dealt
 from cablejax.spatial.accidents import compared, moderated, off
 from cablejax.spatial.cable import SpatialCable, mean_error, typical_error
@@ -50,6 +50,7 @@ class Step:
         halves: fits of both halves.
         error: mean absolute error of each window's free coordinates, from the fit that has not seen it [m], shape [W].
         chance: share of resamples of the recordings in which the error falls.
+        instead_of: the effect that went out when this one came in; "" = none.
         counts: whether the effect could be judged: it is no evidence against one that its simulations are lost.
     """
 
@@ -59,6 +60,7 @@ class Step:
     error: Float[np.ndarray, "W"]
     chance: float
     counts: bool = True
+    instead_of: str = ""
 
 
 def halves(group: Int[np.ndarray, "W"]) -> Bool[np.ndarray, "W"]:
@@ -134,6 +136,7 @@ def tried_with(
     starts: tuple[Explanation, Explanation],
     before: Step,
     progress: Callable[[str], None],
+    instead_of: str = "",
 ) -> Step:
     """Fits both halves from starts, and checks whether that improves the held-out predictions.
 
@@ -143,35 +146,38 @@ def tried_with(
         starts: for either half.
         before: the step to compare with.
         progress: called with a line of text.
+        instead_of: the effect that the starts do without, if any.
     """
     fits = []
     for start, (seen, _, _) in zip(starts, _parts(cable.trusting(before.error)), strict=True):
-        (fit,) = improve(seen, evaluate(seen, [start]), cable.plan.last_steps)
-        fits.append(fit.explanation)
-    halves = fits[0], fits[1]
-    error = unseen_error(cable, halves)
+        evidence = seen.evidence()
+        fits += improve(evidence, evaluate(evidence, [start]), cable.plan.last_steps)
+    fitted = fits[0].explanation, fits[1].explanation
+    error = unseen_error(cable, fitted)
     accepted, chance = falls(before.error, error, cable.recording)
     counts = compared(before.error, error)[1]
     word = "stays" if accepted else "does not help" if counts else "fails in many windows, not judged"
     accidents = f", {off(error).sum()} windows off" if off(error).any() else ""
     was, now = (1e3 * moderated(e).mean() for e in (before.error, error))
-    progress(f"{name}: {was:.2f} -> {now:.2f} mm on unseen recordings{accidents}, {word}")
-    return Step(name, accepted, halves, error, chance, counts)
+    what = f"{name} for {instead_of}" if instead_of else name
+    progress(f"{what}: {was:.2f} -> {now:.2f} mm on unseen recordings{accidents}, {word}")
+    return Step(name, accepted, fitted, error, chance, counts, instead_of)
 
 
 def unseen_error(cable: SpatialCable, halves: tuple[Explanation, Explanation]) -> Float[np.ndarray, "W"]:
     """Error of every window by the fit of the other half [m]."""
     error = np.zeros(len(cable.windows))
     for one, (_, other, index) in zip(halves, _parts(cable), strict=True):
-        error[index] = mean_error(other.predict([one])[0], other.observed)
+        unseen = other.evidence()
+        error[index] = mean_error(unseen.predict([one])[0], unseen.observed)
     return error
 
 
-def _parts(cable: SpatialCable) -> list[tuple[Evidence, Evidence, Int[np.ndarray, "_"]]]:
-    """What either half's fit sees, and what it does not, with its place among the windows."""
+def _parts(cable: SpatialCable) -> list[tuple[SpatialCable, SpatialCable, Int[np.ndarray, "_"]]]:
+    """The cable in what either half's fit sees, and in what it does not, with its place among the windows."""
     first = halves(cable.recording)
     index = [np.flatnonzero(half) for half in (first, ~first)]
-    one, other = (cable.on(cable.windows.chosen(part)).evidence() for part in index)
+    one, other = map(cable.chosen, index)
     return [(one, other, index[1]), (other, one, index[0])]
 
 
@@ -184,16 +190,10 @@ def _starts(
     """
     found, total = [], 0.0
     for base, parts in zip(before, _parts(cable), strict=True):
-        seen, other = (_few(part) for part in parts[:2])
+        seen, other = (part.some(_PROMISED).evidence() for part in parts[:2])
         found.append(_start(seen, base, effect))
         total += typical_error(other, found[-1])
     return (found[0], found[1]), total
-
-
-def _few(evidence: Evidence) -> Evidence:
-    cable = evidence.simulator
-    assert isinstance(cable, SpatialCable)
-    return cable.on(cable.windows.chosen(cable.windows.whole(_PROMISED))).evidence()
 
 
 def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanation:
@@ -201,7 +201,7 @@ def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanat
 
     Far from the solution the model says little.
     """
-    trials = [with_effect(seen.simulator, base, effect, values) for _, values in effect.starts(None)]
+    trials = [base.plus((effect, variant, values)) for variant, values in effect.starts(None)]
     errors = [typical_error(seen, trial) for trial in trials]
     (fit,) = evaluate(seen, [trials[int(np.argmin(errors))]])
     model = fit.model(seen.weight(fit.sse), 0.0)
@@ -214,13 +214,6 @@ def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanat
         if typical_error(seen, moved) < min(errors):
             return moved
     return fit.explanation
-
-
-def with_effect(cable: Simulator, base: Explanation, effect: SpatialEffect, values: Sequence[float]) -> Explanation:
-    """A base with one more effect at these values."""
-    added = explanation((effect, 0, values))
-    both = Explanation((*base.terms, Term(effect, 0)), np.append(base.z, added.z), base.own)
-    return cable.with_own(both)
 
 
 def _resampled(change: Float[np.ndarray, "W"], group: Int[np.ndarray, "W"]) -> Float[np.ndarray, "D"]:

@@ -44,6 +44,7 @@ class Windows:
         episode: that each window is part of, shape [W].
         begin: first sample of each in its episode, shape [W].
         group: recording that each is part of: what is split between fit and check, shape [W].
+        trust: weight of each in fits, shape [W].
         split: "train", "eval" or "" of each window, shape [W].
         name: of each window's episode, for a reader.
         held: number of keypoints held at either end.
@@ -52,7 +53,6 @@ class Windows:
         first_clamp: arc length of the first clamp, from the first keypoint [m].
         gravity: as the log states it [m/s^2].
         rolls: whether the grippers' roll about the cable is that of the log; else it is not known, see `frames_along`.
-        trust: weight of each window in fits, shape [W]; None = 1.
         smoothed: what was taken from the measured paths of the clamps so that they are smooth, root mean square of a
             coordinate [m].
         left_out: where the log has windows without a second that begins with two samples of all keypoints, or in which
@@ -67,6 +67,7 @@ class Windows:
     episode: Int[np.ndarray, "W"]
     begin: Int[np.ndarray, "W"]
     group: Int[np.ndarray, "W"]
+    trust: Float[np.ndarray, "W"]
     split: tuple[str, ...]
     name: tuple[str, ...]
     held: tuple[int, int]
@@ -75,7 +76,6 @@ class Windows:
     first_clamp: float = 0.0
     gravity: tuple[float, ...] = (0.0, 0.0, -GRAVITY)
     rolls: bool = False
-    trust: Float[np.ndarray, "W"] | None = None
     smoothed: float = 0.0
     left_out: tuple[str, ...] = ()
 
@@ -119,11 +119,15 @@ class Windows:
         return np.where(self.valid, distance, np.nan)
 
     @property
+    def noise(self) -> float:
+        """Standard deviation of a coordinate [m], from fourth differences in time, which no motion of a cable has."""
+        return float(np.sqrt((noise_floor(self.observed, None, order=4).std ** 2).mean()))
+
+    @property
     def speed(self) -> float:
         """Root mean square speed of the free markers [m/s], without what the noise adds to differences."""
         step = np.diff(self.observed, axis=1) / self.interval
-        noise = 6.0 * (noise_floor(self.observed, None, order=4).std ** 2).mean() / self.interval**2
-        return float(np.sqrt(max(np.nanmean((step**2).sum(axis=-1)) - noise, 0.0)))
+        return float(np.sqrt(max(np.nanmean((step**2).sum(axis=-1)) - 6.0 * (self.noise / self.interval) ** 2, 0.0)))
 
     def chosen(self, index) -> Windows:
         """Some of the windows."""
@@ -132,10 +136,9 @@ class Windows:
             self,
             **{
                 f: getattr(self, f)[index]
-                for f in ("keypoints", "position", "frames", "valid", "episode", "begin", "group")
+                for f in ("keypoints", "position", "frames", "valid", "episode", "begin", "group", "trust")
             },
             **{f: tuple(getattr(self, f)[i] for i in index) for f in ("split", "name")},
-            trust=None if self.trust is None else self.trust[index],
         )
 
 
@@ -153,6 +156,12 @@ def windows_of(log: GapLog) -> Windows:
     points = np.asarray(log.keypoints, float)
     pose = np.asarray(log.gripper_pose, float)
     valid = log.valid
+    unseen = np.flatnonzero(~np.isfinite(points[valid]).any(axis=(0, 2)))
+    if len(unseen):
+        raise ValueError(
+            f"Keypoint {', '.join(map(str, unseen))} is never observed: leave it out of keypoints and of "
+            "meta.keypoint_arclength_m."
+        )
     tangent = rotated(pose[..., 3:], np.array([1.0, 0.0, 0.0]))
     s = np.asarray(log.meta["keypoint_arclength_m"], float)
     held = held_keypoints(points, pose[..., :3], tangent, valid, s)
@@ -170,12 +179,6 @@ def windows_of(log: GapLog) -> Windows:
     recording = labels(log, "recording")
     groups = {r: i for i, r in enumerate(dict.fromkeys(recording))}
     files, splits = labels(log, "file", "take"), labels(log, "split", default="")
-    unseen = [k for k in range(held[0], len(s) - held[1]) if not np.isfinite(points[valid][:, k]).any()]
-    if unseen:
-        raise ValueError(
-            f"Keypoint {', '.join(map(str, unseen))} is never observed: leave it out of keypoints and of "
-            "meta.keypoint_arclength_m."
-        )
     pieces, left_out = _pieces(points[:, :, free], log.episode_length, samples, math.ceil(_SHORTEST / interval - 1e-9))
     if not pieces:
         raise ValueError(f"No episode has a stretch of {_SHORTEST:g} s whose first two samples show all keypoints.")
@@ -197,6 +200,7 @@ def windows_of(log: GapLog) -> Windows:
         episode=np.array([e for e, _, _ in pieces]),
         begin=np.array([begin for _, begin, _ in pieces]),
         group=np.array([groups[recording[e]] for e, _, _ in pieces]),
+        trust=np.ones(len(pieces)),
         split=tuple(splits[e] for e, _, _ in pieces),
         name=tuple(files[e] for e, _, _ in pieces),
         held=held,
@@ -208,7 +212,7 @@ def windows_of(log: GapLog) -> Windows:
         smoothed=float(np.sqrt((taken**2).mean(axis=-1)).max()),
         left_out=tuple(f"file {files[e]} from {begin * interval:.3g} s" for e, begin in left_out),
     )
-    return dataclasses.replace(windows, trust=np.where(windows.torn, _TORN, 1.0)) if windows.torn.any() else windows
+    return dataclasses.replace(windows, trust=np.where(windows.torn, _TORN, 1.0))
 
 
 def _pieces(
