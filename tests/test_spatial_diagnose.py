@@ -189,6 +189,9 @@ def test_halves_keep_recordings_together():
         assert len(set(first[group == g])) == 1
     assert falls(np.full(8, 2.0), np.full(8, 1.0), group)[0]
     assert not falls(np.full(8, 2.0), np.array([1, 1, 1, 3, 3, 3, 3.0, 3]), group)[0]
+    # one window of one recording is no proof
+    assert not falls(np.full(8, 2.0), np.array([0.5] + 7 * [2.05]), np.zeros(8, int))[0]
+    assert falls(np.full(8, 2.0), np.full(8, 1.0), np.zeros(8, int))[0]
 
 
 def test_refuses_what_it_cannot_diagnose():
@@ -336,6 +339,16 @@ def test_names_the_cause_and_goes_on_where_it_was(tmp_path):
     verdict = json.loads((tmp_path / "report" / "verdict.json").read_text())
     assert verdict == json.loads(json.dumps(verdict_json(result)))
     assert len(verdict["where"]["per_episode_mm"]) == 6
+
+
+@pytest.mark.slow
+def test_the_cause_is_named_from_the_windows_of_one_recording():
+    log = cases.recording(6)
+    log = dataclasses.replace(log, meta={**log.meta, "recording": 6 * ["one"]})
+    result = diagnose_space(log, only=["bending_stiffness", "bending_damping"])
+    assert result.verdict == "named" and {e.name for e in result.effects} == {"bending_stiffness", "bending_damping"}
+    assert result.gap.shrinkage_ci90 is not None
+    assert any("only one recording" in caveat for caveat in result.caveats)
 
 
 def test_one_window_is_too_little_and_one_that_ends_at_once_is_left_out():

@@ -28,13 +28,17 @@ def dealt(group: Int[np.ndarray, "E"], parts: int) -> Int[np.ndarray, "E"]:
     return np.array([part_of[name] for name in group])
 
 
+def independent(group: Int[np.ndarray, "E"]) -> Int[np.ndarray, "E"]:
+    """Labels of what is left out, or drawn, together: the groups of episodes, or each by itself where there is one."""
+    return group if len(np.unique(group)) > 1 else np.arange(len(group))
+
+
 def refitted(evidence: Evidence, fits: Sequence[Fit]) -> list[Fit]:
     """The fits with `Refits`, where the simulator's plan asks for them; those that have some stay as they are."""
     plan, todo = evidence.simulator.plan, [i for i, fit in enumerate(fits) if fit.refits is None]
     if plan.parts is None or not todo:
         return list(fits)
-    several = len(np.unique(evidence.motion)) > 1
-    part_of = dealt(evidence.motion if several else evidence.episodes, plan.parts)
+    part_of = dealt(independent(evidence.motion), plan.parts)
     if not part_of.any():  # one episode: nothing can be left out
         return list(fits)
     result = list(fits)

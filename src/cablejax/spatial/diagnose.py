@@ -266,6 +266,10 @@ def _caveats(windows, left_out, found, own) -> tuple[str, ...]:
             "simulator's edges and time steps: they may be off by more than their intervals."
         )
     groups = len(np.unique(windows.group))
-    if groups < 6:
+    if groups == 1:
+        result.append(
+            "There is only one recording: intervals are over its windows, without what differs between recordings."
+        )
+    elif groups < 6:
         result.append(f"There are only {groups} recordings: intervals over recordings are rough.")
     return tuple(result)

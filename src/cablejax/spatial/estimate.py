@@ -25,6 +25,7 @@ from cablejax.bounded import Result, solve_arrow
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation
+from cablejax.diagnose.refits import independent
 from cablejax.spatial.cable import TWISTED, SpatialCable, typical_error
 from cablejax.spatial.effects import Layout
 
@@ -251,8 +252,7 @@ def jackknife(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "R K"]:
 
     Scaled so that the standard error of anything linear in them is the root of its sum of squares over rows.
     """
-    group = np.asarray(evidence.simulator.recording)[evidence.episodes]
-    label = group if len(np.unique(group)) > 1 else np.arange(len(group))
+    label = independent(np.asarray(evidence.simulator.recording)[evidence.episodes])
     weight, names = evidence.weight(fit.sse), np.unique(label)
 
     def step(use):

@@ -26,7 +26,7 @@ from cablejax.bounded import solve_arrow
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import Explanation, explanation
-from cablejax.diagnose.refits import dealt
+from cablejax.diagnose.refits import dealt, independent
 from cablejax.spatial.accidents import compared, moderated, off
 from cablejax.spatial.cable import SpatialCable, mean_error, typical_error
 from cablejax.spatial.effects import SpatialEffect
@@ -73,11 +73,11 @@ def halves(group: Int[np.ndarray, "W"]) -> Bool[np.ndarray, "W"]:
 def falls(before: Float[np.ndarray, "W"], after: Float[np.ndarray, "W"], group) -> tuple[bool, float]:
     """Whether an error falls beyond chance, and the share of resamples of the recordings in which it does.
 
-    Few windows that are off before or after are left out.
+    Of one recording the windows are resampled. Few windows that are off before or after are left out.
     """
     use, _ = compared(before, after)
     before, after = before[use], after[use]
-    chance = float((_resampled(before - after, np.asarray(group)[use]) > 0).mean())
+    chance = float((_resampled(before - after, independent(np.asarray(group)[use])) > 0).mean())
     return bool(chance > _CHANCE and after.mean() < (1 - _LEAST) * before.mean()), chance
 
 
