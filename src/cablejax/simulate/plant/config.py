@@ -25,7 +25,7 @@ class PlantConfig(ObservedConfig):
 
     Attributes:
         discretisation: the nominal cable, its links and time step. `friction_speed` is ignored and `dimension` must be
-            3.
+            3: another cable is `dataclasses.replace(PlantConfig().discretisation, cable=...)`.
         settle_time: simulated time [s] given to a new cable to settle: without friction, with it, and once more after
             the grippers have come down to the height at which it lies.
 
@@ -52,7 +52,8 @@ class PlantConfig(ObservedConfig):
     def __post_init__(self):
         if self.discretisation.dimension != 3:
             raise ValueError(
-                f"PlantConfig.discretisation.dimension is {self.discretisation.dimension}, expected 3, the plant's."
+                f"PlantConfig.discretisation.dimension is {self.discretisation.dimension}, expected 3, the plant's: "
+                "another cable is `dataclasses.replace(PlantConfig().discretisation, cable=...)`."
             )
         check(self, "seed", settle_time="positive")
         check_camera(self)
