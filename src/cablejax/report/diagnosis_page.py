@@ -59,7 +59,7 @@ INFORMING = frozenset(
 _DPI = 150
 _SPACE_CAPTION = (
     "Up to five seconds of motion, simulated from two observed samples, in the files with the largest, median and "
-    "smallest gaps. Drag to turn, scroll to zoom. The solid line is a fit to other recordings than this file's."
+    "smallest gaps. Drag to turn, scroll to zoom. The solid line is a fit that has not seen this file."
 )
 _WHERE_CAPTION = (
     "Top: the gap of each keypoint over the whole log. Below: each episode over time; darker means further above the "
