@@ -63,6 +63,8 @@ def test_a_cause_is_named_and_what_is_a_recordings_own_is_none():
     assert slope.value == pytest.approx(0.7, abs=0.02) and slope.ci90[0] < 0.7 < slope.ci90[1]  # type: ignore[index]
     assert found.gap.after_rmse_mm == pytest.approx(1e3 * _NOISE, rel=0.1)
     assert diagnose_simulator(Ramps(), recorded(0.0), **options).verdict == "none"
+    repeats = diagnose_simulator(Ramps(), recorded(0.7), **options | {"motion": np.zeros(_EPISODES, int)})
+    assert repeats.verdict == "named" and repeats.gap.shrinkage_ci90 is not None
 
 
 def test_unseen_recordings_have_none_unless_they_are_fitted_too():

@@ -38,7 +38,6 @@ from cablejax.diagnose.judgement import beside_unknown, judged, verdict_sentence
 from cablejax.diagnose.laws import Law
 from cablejax.diagnose.posterior import drawn_by, draws, over_laws, posterior
 from cablejax.diagnose.protocol import Simulator
-from cablejax.diagnose.refits import independent
 from cablejax.diagnose.search import Search
 
 _GRIPPER = "gripper"
@@ -180,7 +179,7 @@ def _telling(best: Fit, explained: float, complete: bool, found: Search) -> bool
     if best.refits is None or null.refits is None:
         return complete or explained >= calibration.telling or explains_most_motions(best, null, evidence, calibration)
     before, after = (fit.refits.sse - evidence.count for fit in (null, best) if fit.refits is not None)
-    interval = shrinkage(before, after, independent(evidence.motion))[1]
+    interval = shrinkage(before, after, evidence.motion)[1]
     return interval is not None and interval[0] > 0
 
 

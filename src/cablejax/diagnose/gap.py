@@ -10,6 +10,7 @@ from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.evidence import Evidence, episodes_by_motion, held_out_together
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Plan
+from cablejax.diagnose.refits import independent
 from cablejax.diagnose.search import without_one
 
 _HORIZONS = (1.0, 2.0, 5.0, 10.0)
@@ -104,7 +105,7 @@ def measure_gap(
         after_rmse_mm=1e3 * rmse(after),
         noise_floor_mm=1e3 * floor,
         shrinkage=ratio if held_out else None,
-        shrinkage_ci90=interval90,
+        shrinkage_ci90=interval90 if held_out else None,
         ahead_mm=ahead_mm,
         # a camera may begin later
         horizons_mm={h: both for h, both in sizes.items() if np.isfinite(both).all()},
@@ -119,14 +120,14 @@ def shrinkage(
 ) -> tuple[float, tuple[float, float] | None]:
     """Of the squared errors above the noise of each episode, with a 90 % interval by resampling motions.
 
-    NaN where they are no larger than the noise before.
+    Of one motion the episodes are resampled. NaN where the errors are no larger than the noise before.
     """
 
     def of(chosen) -> float:
         denominator = before[chosen].sum()
         return 1 - max(after[chosen].sum(), 0.0) / denominator if denominator > 0 else np.nan
 
-    motions = episodes_by_motion(motion)
+    motions = episodes_by_motion(independent(motion))
     whole = float(of(np.arange(len(before))))
     if len(motions) == 1 or not np.isfinite(whole):
         return whole, None

@@ -14,7 +14,6 @@ from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.gap import measure_gap
 from cablejax.diagnose.protocol import explanation
-from cablejax.diagnose.refits import independent
 from cablejax.diagnose.where import HORIZONS, Where, above, sizes_of
 from cablejax.gaplog import labels
 from cablejax.spatial.cable import MORE_EDGES, SpatialCable, bounded
@@ -120,7 +119,7 @@ def gap_of(
         noise=np.full((observed.shape[2], 1), noise),
         temper=np.ones(len(windows)),
         freedom=1.0,
-        motion=independent(windows.group),
+        motion=windows.group,
     )
     gap = measure_gap(
         evidence,

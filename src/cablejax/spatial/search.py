@@ -50,8 +50,8 @@ class Step:
         halves: fits of both halves.
         error: mean absolute error of each window's free coordinates, from the fit that has not seen it [m], shape [W].
         chance: share of resamples of the recordings in which the error falls.
-        instead_of: the effect that went out when this one came in; "" = none.
         counts: whether the effect could be judged: it is no evidence against one that its simulations are lost.
+        instead_of: the effect that went out when this one came in; "" = none.
     """
 
     effect: str
