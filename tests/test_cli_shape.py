@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable
+from cablejax.cable_file import write_cable
 from cablejax.cli import main
 from cablejax.commands import runs
 from cablejax.control.targets import straight_start
@@ -92,7 +93,9 @@ def test_a_motion_that_is_played_leaves_no_page_of_an_earlier_run_next_to_its_lo
 def test_a_motion_that_cannot_be_played_leaves_no_empty_folder(tmp_path, capsys):
     motion, out = tmp_path / "motion.npz", tmp_path / "run"
     write_gap_log(motion, commands_log({"rest": np.repeat(straight_start(Cable())[None], 4, axis=0)}, 0.5, Cable()))
-    for option, value in (("--cable", "nothing.toml"), ("--links", "2")):
+    longer = tmp_path / "longer.toml"
+    write_cable(longer, Cable(length=2.0))
+    for option, value in (("--cable", "nothing.toml"), ("--links", "2"), ("--cable", str(longer))):
         assert main(["shape", "--motion", str(motion), option, value, "--out", str(out)]) == 2
         assert value in capsys.readouterr().err and not out.exists()
 
