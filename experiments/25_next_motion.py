@@ -71,6 +71,8 @@ RANGES = {
     "bending_damping:time_s": (1.5, 5.0),
 }
 """Effects that look alike, and where their parameter is drawn from: strong enough to make a gap on the first log."""
+INSEPARABLE = {"bending_stiffness", "linear_density"}
+"""A uniform cable in slow motion shows only the ratio of stiffness to density and friction."""
 
 
 def staged(seed: int) -> str:
@@ -198,6 +200,29 @@ def made_in(row: dict[str, Any]) -> int:
     return len(row["logs"]) - 1
 
 
+def needed(row: dict[str, Any]) -> float:
+    """Motions after which only the truth is left, and what nothing could separate from it; infinite = not reached."""
+    for added, log in enumerate(row["logs"]):
+        others = set(log["open"]) - {row["truth"]}
+        if row["truth"] in log["open"] and (not others or {row["truth"], *others} == INSEPARABLE):
+            return added
+    return np.inf
+
+
+def table_of_needs(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """By arm: seeds that are answered after so many motions, and the median of motions needed by the rest."""
+    first = {row["seed"] for row in rows if needed(row) == 0}
+    head = ["arm", "by the first log", *(f"by {n} motion{'s' * (n > 1)} more" for n in range(1, ADDED + 1))]
+    table = [[*head, "motions needed by those that the first log does not answer, median"]]
+    for arm in dict.fromkeys(row["arm"] for row in rows):
+        needs = {row["seed"]: needed(row) for row in rows if row["arm"] == arm}
+        counts = [f"{sum(n <= added for n in needs.values())} of {len(needs)}" for added in range(ADDED + 1)]
+        later = [n for seed, n in needs.items() if seed not in first]
+        median = np.median(later) if later else np.nan
+        table.append([arm, *counts, f"{median:g}" if median <= ADDED else f"more than {ADDED}"])
+    return table
+
+
 def page(rows: Sequence[dict[str, Any]], machines: str) -> str:
     """Set sizes and truth in the set by arm and number of added motions, over seeds that all arms have."""
     arms = [arm for arm in ARMS if any(row["arm"] == arm for row in rows)]
@@ -246,6 +271,13 @@ def page(rows: Sequence[dict[str, Any]], machines: str) -> str:
         "of stiffness to density and friction: stiffness and density cannot be separated.",
         "",
         *markdown_table(table),
+        "",
+        "Answered is a seed once only the truth is left, of stiffness and density possibly both (without those below "
+        "1 %):",
+        "",
+        *markdown_table(
+            table_of_needs([row for arm in arms for row in rows if row["arm"] == arm and row["seed"] in common])
+        ),
         "",
         f"Seeds whose first log shows no gap above the simulator's own error: {len(gapless)} "
         f'({", ".join(map(str, gapless)) or "none"}). The verdict on them is "none", and the truth counts as missed.',
