@@ -141,8 +141,8 @@ class Shape(Command):
         commands, cable = read_gap_log(path), find_cable(path if self.cable is None else self.cable)
         if abs(cable.length - (planned := commands.meta["cable"]["length_m"])) > 0.01 * planned:
             raise UsageError(
-                f"{path} is a motion of a cable of {planned:g} m, but {self.cable} has one of {cable.length:g} m, which "
-                "it may tear or fold: give a cable of that length, or leave --cable out."
+                f"{path} is a motion of a cable of {planned:g} m, but {self.cable} has one of {cable.length:g} m, "
+                "which it may tear or fold: give a cable of that length, or leave --cable out."
             )
         plant = plant_of(cable, effects, links=self.links, seed=self.seed)
         noise = 1e-3 * (self.noise_mm or 0.0)
