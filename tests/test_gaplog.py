@@ -274,13 +274,12 @@ def test_logs_of_another_program():
 
 def test_keypoints_may_be_anywhere_and_further_fields_travel(tmp_path):
     arclength = [0.0, 0.1, 0.5, 0.7, 1.0]
-    log = gap_log_from_episodes(
-        [episode(4)], CABLE, source="test", keypoint_arclength=arclength, extra={"split": ["train"]}
-    )
+    cable = dataclasses.replace(CABLE, marks=tuple(arclength))
+    log = gap_log_from_episodes([episode(4)], cable, source="test", extra={"split": ["train"]})
     back = read_gap_log(write_gap_log(tmp_path / "run.npz", log))
     assert back.meta["keypoint_arclength_m"] == arclength and back.meta["split"] == ["train"]
     with pytest.raises(GapLogError, match="keypoint_arclength_m"):
-        gap_log_from_episodes([episode(4)], CABLE, source="test", keypoint_arclength=[0.0, 1.0])
+        gap_log_from_episodes([episode(4)], Cable(n_keypoints=2), source="test")
     with pytest.raises(GapLogError, match="extra fields source are fields of the format"):
         gap_log_from_episodes([episode(4)], CABLE, source="test", extra={"source": "other"})
 

@@ -57,8 +57,6 @@ def gap_log_from_episodes(
     cable: Cable,
     *,
     source: str,
-    grasp: Sequence[str] = ("clamped", "clamped"),
-    keypoint_arclength: Sequence[float] | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> GapLog:
     """One gap log of several episodes of the same cable, padded to the longest.
@@ -67,8 +65,6 @@ def gap_log_from_episodes(
         episodes: at least one; their number of samples may differ.
         cable: the cable and table as they are believed to be, which is what the nominal simulator uses.
         source: free text: what recorded this.
-        grasp: how each gripper holds the cable.
-        keypoint_arclength: of each keypoint [m], shape [N]; by default uniform over the cable.
         extra: fields of `meta` beyond those of the format, which readers that do not know them leave alone.
 
     Raises:
@@ -78,7 +74,6 @@ def gap_log_from_episodes(
         raise GapLogError("A gap log needs at least one episode, got none.")
     if taken := set(extra or {}) & set(META_FIELDS):
         raise GapLogError(f"The extra fields {', '.join(sorted(taken))} are fields of the format: choose other names.")
-    arclength = cable.keypoint_arclength if keypoint_arclength is None else np.asarray(keypoint_arclength, float)
     numbers = {key: getattr(cable, name) for key, (name, _) in NUMBERS.items()}
     table = {"friction_coefficient": numbers.pop("friction_coefficient")}
     return stack_episodes(
@@ -89,8 +84,8 @@ def gap_log_from_episodes(
             # a cable in the plane lies on a table even where that is perfectly smooth
             "table": table if cable.friction_coefficient > 0 or episodes[0].keypoints.shape[-1] == 2 else None,
             "gravity_m_per_s2": [0.0, 0.0, -GRAVITY],
-            "keypoint_arclength_m": arclength.tolist(),
-            "grasp": list(grasp),
+            "keypoint_arclength_m": cable.keypoint_arclength.tolist(),
+            "grasp": list(cable.grasp),
             "motion": [episode.motion for episode in episodes],
             "source": source,
             **(extra or {}),

@@ -44,7 +44,7 @@ def commands_log(motions: Mapping[str, Float[np.ndarray, "T 2 3"]], interval: fl
         for name, poses in motions.items()
     ]
     source = "commands, to be executed and recorded"
-    return gap_log_from_episodes(episodes, cable, source=source, grasp=cable.grasp)
+    return gap_log_from_episodes(episodes, cable, source=source)
 
 
 def write_motion(folder: str | os.PathLike[str], following: NextMotion | None, log: GapLog) -> pathlib.Path | None:

@@ -91,6 +91,7 @@ def gap_log_from_takes(
         damping_time=nominal.damping_time,
         linear_density=nominal.linear_density,
         friction_coefficient=nominal.friction_coefficient or 0.0,
+        marks=tuple(arclength.tolist()),
     )
     episodes = []
     for take in takes:
@@ -111,7 +112,6 @@ def gap_log_from_takes(
         episodes,
         cable,
         source=" ".join([source, *repairs]),
-        keypoint_arclength=arclength.tolist(),
         extra={
             "take": [take.name for take in takes],
             COMMANDS_DERIVED: True,

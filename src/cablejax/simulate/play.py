@@ -62,7 +62,7 @@ def play(plant: TablePlant, log: GapLog, *, source: str, noise: float = 0.0, see
                 random=random,
             )
         )
-    return gap_log_from_episodes(episodes, plant.config.cable, source=source, grasp=plant.config.cable.grasp)
+    return gap_log_from_episodes(episodes, plant.config.cable, source=source)
 
 
 def played(
