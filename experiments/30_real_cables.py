@@ -4,9 +4,11 @@
 
 reads every cable of a folder of recordings, here DLO1.npz to DLO3.npz (public data of Chen et al., CoRL 2024, arXiv
 2406.05931), and writes docs/results/real_cables.md with its figure. `--data` is a folder of .npz files, or of folders
-of .pkl files as upstream has them. Published figures are read from a table (`--published`): one line for each method,
-one column for each cable, in millimetres. All choices are made by leaving out recordings of the train split; the eval
-split, where there is one, is scored once, at the end. Resumes after an interruption.
+of .pkl files as upstream has them. Recordings are checked and repaired as `cablejax import deform` does. A cable that
+it would refuse is named on the page with the reason, and the others are scored. Published figures are read from a table
+(`--published`): one line for each method, one column for each cable, in millimetres. All choices are made by leaving
+out recordings of the train split; the eval split, where there is one, is scored once, at the end. Resumes after an
+interruption.
 """
 
 from __future__ import annotations
@@ -18,11 +20,11 @@ import os
 import pathlib
 import sys
 
-from cablejax.recordings.deform import DeformRecordings, read_deform
+from cablejax.recordings.deform import DeformRecordings, read_deform, repaired_blocks
 from pages import publish
 from real_cables.benchmark import score_cable
-from real_cables.page import errors_figure, page, read_published
-from real_cables.protocol import cables_in
+from real_cables.page import Notes, errors_figure, page, read_published
+from real_cables.protocol import cables_in, protocol_windows
 from rows import Rows, made_on
 
 _PUBLISHED = pathlib.Path(__file__).parent / "real_cables" / "published.csv"
@@ -38,7 +40,7 @@ def main() -> None:
         "--figure", type=pathlib.Path, help="default: images/NAME.png of the folder above that of --out"
     )
     arguments = parser.parse_args()
-    read = {name: dataclasses.replace(read_deform(path), name=name) for name, path in cables_in(arguments.data).items()}
+    read, repairs, refused = _read(arguments.data)
     published = read_published(arguments.published)
 
     def scored(cable: str, _: str):
@@ -57,7 +59,29 @@ def main() -> None:
     picture = arguments.figure or out.parent.parent / "images" / f"{out.stem}.png"
     picture.parent.mkdir(parents=True, exist_ok=True)
     errors_figure(scores, published, picture)
-    publish(page(scores, published, os.path.relpath(picture, out.parent), made_on(rows.path)), out)
+    notes = Notes(repairs, refused)
+    publish(page(scores, published, os.path.relpath(picture, out.parent), made_on(rows.path), notes), out)
+
+
+def _read(folder: pathlib.Path) -> tuple[dict[str, DeformRecordings], dict[str, list[str]], dict[str, str]]:
+    """The cables that can be scored, what was repaired in each, and why others cannot be scored.
+
+    Raises:
+        ValueError: no cable can be scored.
+    """
+    read, repairs, refused = {}, {}, {}
+    for name, path in cables_in(folder).items():
+        try:
+            recordings = dataclasses.replace(read_deform(path), name=name)
+            read[name], repairs[name] = repaired_blocks(recordings)
+            protocol_windows(read[name])
+        except ValueError as error:
+            read.pop(name, None)
+            refused[name] = str(error)
+            print(f"{name} is not scored: {error}", file=sys.stderr, flush=True)
+    if not read:
+        raise ValueError(f"No cable in {folder} can be scored: " + " ".join(refused.values()))
+    return read, repairs, refused
 
 
 def _key(recordings: DeformRecordings) -> tuple[str, str]:

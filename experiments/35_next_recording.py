@@ -32,7 +32,7 @@ from jaxtyping import Float
 from scipy.stats import spearmanr
 
 from cablejax.diagnose.information import parameter_information
-from cablejax.recordings.deform import NOMINAL, read_deform
+from cablejax.recordings.deform import NOMINAL, read_deform, repaired_blocks
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.effects import GRIP
@@ -83,7 +83,8 @@ def trial(data: str | None, name: str, seed: int) -> dict[str, Any]:
         windows = dataclasses.replace(windows, split=("train",) * 16 + ("eval",) * (len(windows) - 16))
     else:
         assert data is not None
-        windows = protocol_windows(read_deform(cables_in(pathlib.Path(data))[name]))
+        recordings, _ = repaired_blocks(read_deform(cables_in(pathlib.Path(data))[name]))
+        windows = protocol_windows(recordings)
     is_eval, whole = np.array(windows.split) == "eval", windows.whole(len(windows))
     drawn = rng.permutation(whole[~is_eval[whole]])[: FIRST + CANDIDATES]
     first, candidates = drawn[:FIRST], drawn[FIRST:]

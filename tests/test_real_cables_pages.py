@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import pickle
 
 import numpy as np
 import pytest
 
 import spatial_cases as cases
-from cablejax.recordings.deform import DeformRecordings
+from cablejax.recordings.deform import DeformRecordings, repaired_blocks
 from cablejax.spatial.windows import windows_of
 from real_cables import benchmark, network
 from real_cables.benchmark import errors_of, spread_of
-from real_cables.page import errors_figure, page, read_published
+from real_cables.page import Notes, errors_figure, page, read_published
 from real_cables.protocol import cables_in, protocol_windows
 from recording_cases import DT, swinging
+
+script = importlib.import_module("30_real_cables")
 
 
 def blocks(count: int = 4, split: str = "") -> DeformRecordings:
@@ -55,9 +58,46 @@ def test_windows_of_recordings_with_gaps():
     np.testing.assert_allclose(windows.arclength, whole.arclength, atol=1e-3)
     np.testing.assert_allclose(windows.position[1, 50:55], whole.position[1, 50:55], atol=3e-3)
     assert np.isnan(windows.observed[2, 80:90, 1:4]).all()
+    with pytest.raises(ValueError, match=r"one block may be fitted, expected at least two"):
+        protocol_windows(recordings.chosen(np.array([0])))
     points[:, :, 3] = np.nan
     with pytest.raises(ValueError, match="no block begins"):
         protocol_windows(recordings)
+
+
+def test_recordings_are_checked_and_repaired_before_they_are_scored_and_no_sample_is_cut():
+    right, recordings = blocks(), blocks()
+    points = recordings.keypoints
+    points[0, 50:90, [3, 4]] = points[0, 50:90, [4, 3]]
+    points[1, 100, 5] += [0.0, 0.3, 0.0]
+    points[3] = np.nan
+    recordings = dataclasses.replace(recordings, keypoints=1000 * points)
+    found, repairs = repaired_blocks(recordings)
+    assert found.source_id.tolist() == [0, 1, 2] and np.isnan(found.keypoints[1, 100, 5]).all()
+    np.testing.assert_allclose(found.keypoints[[0, 2]], right.keypoints[[0, 2]], atol=1e-12)
+    assert [words for words in ("Block 3", "in mm", "exchanged", "keypoint 5 is farther") if words in " ".join(repairs)]
+    assert len(repairs) == 4
+    np.testing.assert_allclose(protocol_windows(found).arclength, protocol_windows(right).arclength, atol=1e-3)
+    sideways = dataclasses.replace(recordings, keypoints=points[..., [1, 2, 0]])
+    with pytest.raises(ValueError, match=r"sags in the direction opposite to y"):
+        repaired_blocks(sideways)
+
+
+def test_a_cable_that_cannot_be_scored_is_named_and_the_others_are_read(tmp_path):
+    good = blocks()
+    fields = {"dt": good.dt, "split": good.split, "source_id": good.source_id, "recording_guess": good.recording}
+    np.savez(tmp_path / "rope.npz", keypoints=good.keypoints, **fields)
+    branch = good.keypoints[:, :, 4:5] - np.array([0.0, 0.0, 0.08]) * np.arange(1, 4)[:, None]
+    np.savez(tmp_path / "tree.npz", keypoints=np.concatenate([good.keypoints, branch], axis=2), **fields)
+    (tmp_path / "torn.npz").write_bytes(b"PK")
+    read, repairs, refused = script._read(tmp_path)
+    assert list(read) == ["rope"] and repairs == {"rope": []} and list(refused) == ["torn", "tree"]
+    assert "This is a branched cable" in refused["tree"]
+    text = page({"rope": score(False)}, {}, "errors.png", "where", Notes({"rope": ["Mended."]}, refused))
+    assert "- tree is not scored. This is a branched cable" in text and "- rope: Mended." in text
+    (tmp_path / "rope.npz").unlink()
+    with pytest.raises(ValueError, match=r"No cable in .* can be scored: .* This is a branched cable"):
+        script._read(tmp_path)
 
 
 def test_a_lost_window_is_counted_and_does_not_make_the_mean():

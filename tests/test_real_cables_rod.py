@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose.protocol import explanation
-from cablejax.recordings.deform import NOMINAL, read_deform
+from cablejax.recordings.deform import NOMINAL, read_deform, repaired_blocks
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.accidents import off
 from cablejax.spatial.cable import SpatialCable, errors
@@ -25,7 +25,7 @@ _EFFECTS = ("bending_stiffness", "bending_damping", "stiffness_profile", "grippe
 @needs_deform
 @pytest.mark.parametrize("values", _VALUES)
 def test_file_67_of_dlo1_is_not_lost(values):
-    windows = protocol_windows(read_deform(DATA / "deform" / "DLO1.npz"))
+    windows = protocol_windows(repaired_blocks(read_deform(DATA / "deform" / "DLO1.npz"))[0])
     layout = layout_of(windows, NOMINAL.stiffness_over_density)
     one = explanation(*((layout.named(name), 0, value) for name, value in zip(_EFFECTS, values, strict=True)))
     near = [i for i in range(len(windows)) if windows.name[i] in ("65", "66", "67", "68")]

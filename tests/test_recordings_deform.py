@@ -68,6 +68,16 @@ def test_one_pickle_is_a_recording_of_its_own(folder):
     assert recordings.keypoints.shape == (1, 200, 9, 3) and recordings.split.tolist() == ["eval"]
 
 
+def test_blocks_without_a_position_are_left_out_and_hidden_files_are_no_blocks(folder):
+    (folder / "train" / "._1.pkl").write_bytes(b"of another system")
+    every, _ = import_deform(folder)
+    lost = next(iter(sorted(folder.glob("*/[0-9]*.pkl"))))
+    lost.write_bytes(pickle.dumps(np.full_like(pickle.loads(lost.read_bytes()), np.nan)))
+    log, repairs = import_deform(folder)
+    assert log.meta["file"] == [file for file in every.meta["file"] if file != int(lost.stem)]
+    assert repairs[0] == f"Block {lost.stem} has no observed position: left out."
+
+
 def test_a_short_block_ends_with_nan_and_its_episode_ends_there(folder):
     path = folder / "train" / "9.pkl"
     path.write_bytes(pickle.dumps(swinging(120).transpose(0, 2, 1)))

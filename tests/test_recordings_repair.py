@@ -131,10 +131,16 @@ def test_a_branched_cable_is_refused_by_that_name():
 
 
 def test_a_branch_may_begin_on_top_of_the_parent():
-    points = branched()
-    points = np.concatenate([points[:, :9], points[:, 3:4] + 0.002, points[:, 9:12]], axis=1)
-    with pytest.raises(ValueError, match="keypoints 9 to 12 leave it at keypoint 3"):
-        restore_order((take(points),))
+    for off in (0.002, 0.0):
+        points = branched()
+        points = np.concatenate([points[:, :9], points[:, 3:4] + off, points[:, 9:12]], axis=1)
+        with pytest.raises(ValueError, match="keypoints 9 to 12 leave it at keypoint 3"):
+            prepare((take(points),), PAIRS)
+
+
+def test_a_branch_of_one_marker_is_named_as_one():
+    with pytest.raises(ValueError, match=r"keypoint 9 leaves it at keypoint 3\).* and leave out 9; the mass"):
+        restore_order((take(branched()[:, :10]),))
 
 
 @pytest.mark.parametrize(
@@ -337,7 +343,19 @@ def test_neighbours_that_a_tracker_puts_at_the_origin_are_not_observed_there():
     assert np.isnan(one.keypoints[70:76, 4:6]).all()
     points[70:76, 4:6] = np.nan
     np.testing.assert_array_equal(one.keypoints, points)
-    assert [text.split(" is farther")[0] for text in repairs] == ["Take a: keypoint 4", "Take a: keypoint 5"]
+    assert [text.split(" is at one")[0] for text in repairs] == ["Take a: keypoint 4", "Take a: keypoint 5"]
+
+
+def test_lost_markers_at_one_place_are_not_observed_there_even_both_of_a_gripper():
+    points = swinging()
+    points[70:74, [0, 1, 4]] = 0.0
+    (one, *_), repairs = prepare((take(points), *others()), PAIRS)
+    assert np.isnan(one.keypoints[70:74, 4]).all() and np.isfinite(one.keypoints[:, [0, 1]]).all()
+    np.testing.assert_allclose(one.keypoints[70:74, :2], swinging()[70:74, :2], atol=3e-3)
+    assert repairs[0].startswith("Take a: keypoint 0 is at one place with another one in 4 of 200 samples")
+    points[:, 5] = points[:, 4]
+    with pytest.raises(ValueError, match=r"Keypoints 4 and 5 are at one place in 100 % .* leave one of the two out"):
+        prepare((take(points),), PAIRS)
 
 
 def test_a_marker_whose_tracker_holds_it_is_not_observed_meanwhile():

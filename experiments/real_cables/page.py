@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import math
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +20,8 @@ _PANELS = 3
 _DRAWN = ("-", ":")
 _TITLES = {"rod": "rod with all effects, fitted together"}
 _NONE = "-"
+# Sentences on repairs of a cable that are shown.
+_SHOWN = 8
 
 Published = Mapping[str, Mapping[str, float]]
 """Error of each method [mm], by cable."""
@@ -76,7 +79,20 @@ def errors_figure(scores: Mapping[str, Any], published: Published, path: pathlib
     figure.savefig(path, dpi=130)
 
 
-def page(scores: Mapping[str, Any], published: Published, picture: str, made: str) -> str:
+@dataclasses.dataclass(frozen=True)
+class Notes:
+    """What was found in recordings before they were scored.
+
+    Attributes:
+        repairs: sentences on the repairs, by cable.
+        refused: why a cable is not scored, by its name.
+    """
+
+    repairs: Mapping[str, Sequence[str]] = dataclasses.field(default_factory=dict)
+    refused: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+
+def page(scores: Mapping[str, Any], published: Published, picture: str, made: str, notes: Notes = Notes()) -> str:
     """The page in Markdown.
 
     Args:
@@ -84,6 +100,7 @@ def page(scores: Mapping[str, Any], published: Published, picture: str, made: st
         published: by `read_published`.
         picture: path of the figure, from the page.
         made: versions and machine, see `rows.made_on`.
+        notes: on the recordings.
     """
     every, scored = list(scores), [cable for cable in scores if scores[cable]["learned"][0][2] is not None]
     learned = [name for name, *_ in scores[every[0]]["learned"]]
@@ -120,7 +137,7 @@ def page(scores: Mapping[str, Any], published: Published, picture: str, made: st
             *_on_eval({c: scores[c] for c in scored}, published, learned, best),
             "",
         ]
-    lines += [*_step_by_step(scores), *_left_out(scores)]
+    lines += [*_step_by_step(scores), *_left_out(scores), *_noted(notes)]
     lines += [
         "One procedure with one set of constants for all cables. Ridge residual and graph network read the clamps' "
         "history of 0.4 s and the simulated markers, in a frame that moves with the clamps; regularisation, number of "
@@ -278,6 +295,19 @@ def _left_out(scores: Mapping[str, Any]) -> list[str]:
         if score["left_out"]
     ]
     return [" ".join(sentences), ""] if sentences else []
+
+
+def _noted(notes: Notes) -> list[str]:
+    refused = [f"- {cable} is not scored. {reason}" for cable, reason in notes.refused.items()]
+    repairs = [
+        f"- {cable}: {' '.join(sentences[:_SHOWN])}"
+        + (f" And {len(sentences) - _SHOWN} more." if len(sentences) > _SHOWN else "")
+        for cable, sentences in notes.repairs.items()
+        if sentences
+    ]
+    if not refused + repairs:
+        return []
+    return ["## Repairs before the scores", "", *refused, *repairs, ""]
 
 
 def _ratio(one: float, other: float) -> float:

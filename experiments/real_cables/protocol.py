@@ -50,14 +50,18 @@ def cables_in(path: pathlib.Path) -> dict[str, pathlib.Path]:
 
 
 def protocol_windows(recordings: DeformRecordings) -> Windows:
-    """Every block as one window. Swapped pairs are put right; samples after a jump in time, or after the grippers were
-    not seen for 0.1 s, are not fitted nor scored by `Windows.valid`, but simulated through. A block that does not begin
-    with two samples of all markers is left out.
+    """Every block as one window. Samples after a jump in time, or after the grippers were not seen for 0.1 s, are not
+    fitted nor scored by `Windows.valid`, but simulated through. A block that does not begin with two samples of all
+    markers is left out.
+
+    Args:
+        recordings: checked and repaired, see `repaired_blocks`.
 
     Raises:
-        ValueError: neighbouring markers are never observed together, or no block begins with two whole samples.
+        ValueError: neighbouring markers are never observed together, no block begins with two whole samples, or only
+            one may be fitted.
     """
-    points = _put_right(recordings.keypoints)
+    points = recordings.keypoints
     held, count = _followed(points[:, :, _HELD], recordings.dt)
     step = np.stack([median_step(block) for block in points])
     padded = np.pad(step, ((0, 0), (1, 1)))
@@ -74,6 +78,10 @@ def protocol_windows(recordings: DeformRecordings) -> Windows:
         k = int(unseen.argmax())
         raise ValueError(f"{recordings.name}: markers {k} and {k + 1} are never observed together: leave one out.")
     lengths = np.nanquantile(spacing.reshape(-1, spacing.shape[-1]), _STRAIGHT, axis=0)[1:-1]
+    if fitted[whole].sum() == 1 or whole.sum() == 1:
+        raise ValueError(
+            f"{recordings.name}: one block may be fitted, expected at least two, so that one can be left out of a fit."
+        )
     every = Windows(
         keypoints=points[:, :, 2:-2],
         position=held[:, :, [1, 2]],
@@ -92,17 +100,6 @@ def protocol_windows(recordings: DeformRecordings) -> Windows:
     )
     left_out = tuple(f"file {every.name[i]}" for i in np.flatnonzero(~whole))
     return dataclasses.replace(every.chosen(np.flatnonzero(whole)), left_out=left_out)
-
-
-def _put_right(points: Float[np.ndarray, "W T N 3"]) -> Float[np.ndarray, "W T N 3"]:
-    """The same with the markers of a gripper exchanged where the outer one is nearer to the cable."""
-    points = points.copy()
-    for outer, inner, third in ((0, 1, 2), (-1, -2, -3)):
-        near, far = (np.linalg.norm(points[:, :, k] - points[:, :, third], axis=-1) for k in (outer, inner))
-        swapped = (far > near)[:, :, None, None]
-        pair = [outer, inner]
-        points[:, :, pair] = np.where(swapped, points[:, :, pair[::-1]], points[:, :, pair])
-    return points
 
 
 def _followed(held: Float[np.ndarray, "W T 4 3"], dt: float) -> tuple[np.ndarray, np.ndarray]:

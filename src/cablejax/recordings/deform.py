@@ -15,14 +15,14 @@ import pathlib
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from cablejax.limits import shown
 from cablejax.npz import read_npz
 from cablejax.recordings.assemble import Nominal, gap_log_from_takes
 from cablejax.recordings.frames import Frame
 from cablejax.recordings.pickles import read_pickle
-from cablejax.recordings.prepare import Setup, prepare
+from cablejax.recordings.prepare import Setup, prepare, repaired
 from cablejax.recordings.take import Take
 from cablejax.types import GapLog
 
@@ -74,6 +74,11 @@ class DeformRecordings:
                 f"{self.name}: split has {shown(unknown[0])}, expected train, eval, which is never fitted, or nothing."
             )
 
+    def chosen(self, index: Int[np.ndarray, " S"]) -> DeformRecordings:
+        """Some of the blocks."""
+        parts = {f: getattr(self, f)[index] for f in ("keypoints", "split", "recording", "source_id")}
+        return dataclasses.replace(self, **parts)
+
 
 def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:
     """Reads the recordings of one cable, in double precision and in the order of their numbers.
@@ -88,7 +93,9 @@ def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:
     """
     path = pathlib.Path(path)
     if path.is_dir():
-        return _read_pickles(path, sorted([*path.glob("*.pkl"), *path.glob("*/*.pkl")]))
+        found = [*path.glob("*.pkl"), *path.glob("*/*.pkl")]
+        # hidden ones are not recordings: other systems leave some in copied folders
+        return _read_pickles(path, sorted(file for file in found if not file.name.startswith(".")))
     if path.suffix.lower() == ".npz":
         return _read_npz(path)
     if path.suffix.lower() in (".pkl", ".pickle"):
@@ -187,10 +194,6 @@ def takes_of(recordings: DeformRecordings) -> tuple[Take, ...]:
     takes = []
     for index, points in enumerate(recordings.keypoints):
         seen = np.flatnonzero(np.isfinite(points).any(axis=(1, 2)))
-        if len(seen) == 0:
-            raise ValueError(
-                f"{recordings.name}: block {recordings.source_id[index]} has no observed position: leave it out."
-            )
         points = points[: seen[-1] + 1]
         takes.append(
             Take(
@@ -224,8 +227,9 @@ def import_deform(
     Raises:
         ValueError: nothing that can be read, or used without guessing.
     """
-    recordings = read_deform(path)
+    recordings, left_out = _seen(read_deform(path))
     takes, repairs = prepare(takes_of(recordings), Setup(unit=unit, frame=frame, on_grippers="pairs"))
+    repairs = [*left_out, *repairs]
     source = (
         f"{recordings.name} of the DEFORM data set (Chen et al., CoRL 2024, arXiv 2406.05931). The length is measured "
         "along the markers, which sit off the centreline. Diameter, linear density and bending stiffness are guesses: "
@@ -233,3 +237,34 @@ def import_deform(
         "observed; commands are differences of these poses."
     )
     return gap_log_from_takes(takes, NOMINAL, source=source, repairs=repairs), repairs
+
+
+def repaired_blocks(recordings: DeformRecordings) -> tuple[DeformRecordings, list[str]]:
+    """The blocks after the checks and repairs of an import that leave every sample where it is: none is cut.
+
+    For whoever scores whole blocks, as upstream does.
+
+    Returns:
+        Blocks with markers in metres, in their order, NaN where a reading cannot be right; and a sentence on each
+        repair.
+
+    Raises:
+        ValueError: as `import_deform`.
+    """
+    recordings, left_out = _seen(recordings)
+    takes, repairs = repaired(takes_of(recordings), Setup(unit=None))
+    points = np.full_like(recordings.keypoints, np.nan)
+    for row, take in zip(points, takes, strict=True):
+        row[: len(take.keypoints)] = take.keypoints
+    return dataclasses.replace(recordings, keypoints=points), [*left_out, *repairs]
+
+
+def _seen(recordings: DeformRecordings) -> tuple[DeformRecordings, list[str]]:
+    """The blocks with an observed position, and a sentence on those without."""
+    seen = np.isfinite(recordings.keypoints).any(axis=(1, 2, 3))
+    if seen.all():
+        return recordings, []
+    if not seen.any():
+        raise ValueError(f"{recordings.name}: no block has an observed position: expected markers' positions.")
+    empty = ", ".join(map(str, recordings.source_id[~seen]))
+    return recordings.chosen(np.flatnonzero(seen)), [f"Block {empty} has no observed position: left out."]

@@ -54,11 +54,18 @@ def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
     usual = typical_spacing(takes)
     if branches := _branches(np.concatenate([take.keypoints for take in takes]), usual):
         parent = branches[0][0]
-        where = "; ".join(f"keypoints {first} to {last} leave it at keypoint {at}" for first, last, at in branches)
+        where = "; ".join(
+            f"keypoints {first} to {last} leave it at keypoint {at}"
+            if last > first
+            else f"keypoint {first} leaves it at keypoint {at}"
+            for first, last, at in branches
+        )
+        last = branches[-1][1]
+        rest = f"{parent} to {last}" if last > parent else str(last)
         raise ValueError(
             f"This is a branched cable: after keypoint {parent - 1} the chain continues next to an earlier keypoint "
             f"({where}). Only a cable without branches is simulated. To diagnose the parent alone, give keypoints 0 to "
-            f"{parent - 1} and leave out {parent} to {branches[-1][1]}; the mass of the branches is then missing."
+            f"{parent - 1} and leave out {rest}; the mass of the branches is then missing."
         )
     if len(usual) < _FEWEST:
         return takes, []

@@ -181,7 +181,10 @@ def read_pickle(path: str | os.PathLike[str]) -> Any:
     except UnsafePickleError as error:
         raise UnsafePickleError(refused + str(error)) from None
     except Exception as error:  # a damaged pickle can fail anywhere in the loader, with any kind of error
-        raise ValueError(f"{refused}it is no pickle, or a damaged one ({type(error).__name__}: {error}).") from None
+        raise ValueError(
+            f"{refused}it is no pickle, or a damaged one ({type(error).__name__}: {error}). "
+            "Copy it again, or leave it out."
+        ) from None
 
 
 def _check_opcodes(data: bytes) -> None:

@@ -21,7 +21,7 @@ from cablejax.recordings.frames import (
 )
 from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
-from cablejax.recordings.strays import without_held, without_jumps, without_outliers, without_stretched
+from cablejax.recordings.strays import without_doubles, without_held, without_jumps, without_outliers, without_stretched
 from cablejax.recordings.take import Take, spacing, typical_spacing
 from cablejax.recordings.units import METRES, recognised_unit, require_metres
 
@@ -67,10 +67,8 @@ class Setup:
 def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:
     """Checks and repairs takes of one cable, and gives each the poses of both grippers.
 
-    In this order: the unit of length; the frame; heights above a table, which are left out; branches and the order of
-    the markers; whether it is one cable; single markers that are held or jump; takes in which the cable stretches,
-    which are left out; poses that jump away and back, and gaps in time; orientations against markers; jerks of the
-    grippers, which are kept.
+    In this order: all of `repaired`; takes in which the cable stretches, which are left out; poses that jump away and
+    back, and gaps in time; orientations against markers; jerks of the grippers, which are kept.
 
     Returns:
         The takes in metres, z up, right-handed, without gaps, each with gripper poses; and a sentence on each repair.
@@ -79,46 +77,12 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
         ValueError: something is wrong that cannot be repaired without guessing; says what was found, what was
             expected and what to do.
     """
-    if not takes:
-        raise ValueError("The recording has no take, expected at least one.")
-    shapes = sorted({take.keypoints.shape[1:] for take in takes})
-    if len(shapes) > 1 or shapes[0][0] < (5 if setup.on_grippers == "pairs" else 3):
-        raise ValueError(
-            f"The takes have keypoints of the shapes {', '.join(map(str, shapes))}, expected one shape with at least "
-            "three keypoints, or five if the first two and the last two are on the grippers."
-        )
+    takes, repairs = repaired(takes, setup)
     measured = takes[0].gripper_pose is not None
-    if not measured and setup.on_grippers == "ends":
-        raise ValueError(
-            "The grippers' poses are not given, and only one keypoint is on each: name the columns or topics of the "
-            "poses, or two keypoints on each gripper."
-        )
-    repairs: list[str] = []
-
-    def noted(result: tuple[tuple[Take, ...], list[str]]) -> tuple[Take, ...]:
-        """The takes of a step, whose sentences are noted."""
-        repairs.extend(result[1])
-        return result[0]
-
-    takes = noted(_in_metres(takes, setup))
-    points = [take.keypoints for take in takes]
-    if all(len(own) > 1 and np.array_equal(own[1:], own[:-1], equal_nan=True) for own in points):
-        raise ValueError(
-            "All samples have the same keypoints to the last digit, which no tracker measures: expected a recording of "
-            "a cable that moves. Check which columns or topic are read, and that the tracker ran."
-        )
-    takes = tuple(into_frame(take, setup.frame) for take in noted(without_outliers(takes)))
-    if not setup.hangs and takes[0].keypoints.shape[2] == 3:
-        takes = noted(onto_table(takes))
-    takes = noted(restore_order(takes))
-    _require_one_cable(takes, setup)
-    for step in (without_held, without_jumps, without_stretched):
-        takes = noted(step(takes))
-    if takes[0].keypoints.shape[2] == 3:
-        require_hanging(takes, setup.frame)
+    takes = _noted(without_stretched(takes), repairs)
     last = takes[0].keypoints.shape[1] - 1
     pairs = ((0, 1), (last - 1, last))
-    takes = noted(cut_at_gaps(takes, None if measured else (*pairs[0], *pairs[1])))
+    takes = _noted(cut_at_gaps(takes, None if measured else (*pairs[0], *pairs[1])), repairs)
     if measured and takes[0].keypoints.shape[2] == 3:
         if setup.on_grippers == "pairs":
             require_rigid(takes, pairs)
@@ -128,6 +92,59 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
     return takes, [*repairs, *_jerks(takes)]
+
+
+def repaired(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:
+    """Checks and repairs takes of one cable without leaving out any sample.
+
+    In this order: the unit of length; markers at one place; the frame; heights above a table, which are left out;
+    branches and the order of the markers; whether it is one cable; single markers that are held or jump; which way is
+    up.
+
+    Returns:
+        As many takes, of as many samples, in metres, z up, right-handed; and a sentence on each repair.
+
+    Raises:
+        ValueError: as `prepare`.
+    """
+    if not takes:
+        raise ValueError("The recording has no take, expected at least one.")
+    shapes = sorted({take.keypoints.shape[1:] for take in takes})
+    if len(shapes) > 1 or shapes[0][0] < (5 if setup.on_grippers == "pairs" else 3):
+        raise ValueError(
+            f"The takes have keypoints of the shapes {', '.join(map(str, shapes))}, expected one shape with at least "
+            "three keypoints, or five if the first two and the last two are on the grippers."
+        )
+    if takes[0].gripper_pose is None and setup.on_grippers == "ends":
+        raise ValueError(
+            "The grippers' poses are not given, and only one keypoint is on each: name the columns or topics of the "
+            "poses, or two keypoints on each gripper."
+        )
+    repairs: list[str] = []
+    takes = _noted(_in_metres(takes, setup), repairs)
+    takes = _noted(without_doubles(takes), repairs)
+    points = [take.keypoints for take in takes]
+    if all(len(own) > 1 and np.array_equal(own[1:], own[:-1], equal_nan=True) for own in points):
+        raise ValueError(
+            "All samples have the same keypoints to the last digit, which no tracker measures: expected a recording of "
+            "a cable that moves. Check which columns or topic are read, and that the tracker ran."
+        )
+    takes = tuple(into_frame(take, setup.frame) for take in _noted(without_outliers(takes), repairs))
+    if not setup.hangs and takes[0].keypoints.shape[2] == 3:
+        takes = _noted(onto_table(takes), repairs)
+    takes = _noted(restore_order(takes), repairs)
+    _require_one_cable(takes, setup)
+    for step in (without_held, without_jumps):
+        takes = _noted(step(takes), repairs)
+    if takes[0].keypoints.shape[2] == 3:
+        require_hanging(takes, setup.frame)
+    return takes, repairs
+
+
+def _noted(result: tuple[tuple[Take, ...], list[str]], repairs: list[str]) -> tuple[Take, ...]:
+    """The takes of a step, whose sentences are added to those on the repairs before."""
+    repairs.extend(result[1])
+    return result[0]
 
 
 def _require_one_cable(takes: tuple[Take, ...], setup: Setup) -> None:

@@ -21,6 +21,9 @@ _TAUT = 1.3, 0.01
 """A cable does not stretch: neighbouring keypoints farther apart than usual by this factor, and by more than this part
 of the cable's length, are not both on it."""
 
+_ONE_MARKER = 0.5
+"""Two keypoints that are at one place in more than this part of the samples are one marker."""
+
 _FEW_STRETCHED = 0.2
 """Up to this part of the takes is left out where the cable stretches; more have a cause that needs another mend."""
 
@@ -59,6 +62,39 @@ def without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
 
     words = "is farther from its neighbours than the cable allows in {where}: treated as not observed."
     return _without(takes, off, words)
+
+
+def without_doubles(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
+    """Marks keypoints as not observed that are at one place with another one: a tracker puts all it has lost at one.
+
+    A branch may begin with the keypoint that it leaves the cable at: those are at one place throughout, and stay.
+
+    Raises:
+        ValueError: two neighbours are at one place in most samples: it is one marker.
+    """
+    points = np.concatenate([take.keypoints for take in takes])
+    count = points.shape[1]
+    pairs = [(i, j) for i, j in itertools.combinations(range(count), 2) if _doubled(points, i, j).mean() > 0]
+    mostly = [pair for pair in pairs if _doubled(points, *pair).mean() > _ONE_MARKER]
+    if neighbours := [(i, j) for i, j in mostly if j == i + 1]:
+        i, j = neighbours[0]
+        raise ValueError(
+            f"Keypoints {i} and {j} are at one place in {100 * _doubled(points, i, j).mean():.0f} % of the samples, "
+            "expected a marker of its own for each: leave one of the two out, or check which columns or topic are read."
+        )
+
+    def off(points: Float[np.ndarray, "T N D"]) -> np.ndarray:
+        found = np.zeros(points.shape[:2], bool)
+        for pair in pairs:
+            if pair not in mostly:
+                found[:, pair] |= _doubled(points, *pair)[:, None]
+        return found
+
+    return _without(takes, off, "is at one place with another one in {where}: treated as not observed.")
+
+
+def _doubled(points: Float[np.ndarray, "T N D"], one: int, other: int) -> np.ndarray:
+    return np.asarray((points[:, one] == points[:, other]).all(axis=-1))
 
 
 def without_held(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
