@@ -144,7 +144,7 @@ def test_a_window_begins_where_all_keypoints_are_observed():
 def test_windows_that_never_show_all_keypoints_are_counted():
     log = cases.recording()
     points = log.keypoints.copy()
-    points[2, 1:-1:2, 4] = np.nan
+    points[2, np.arange(points.shape[1]) % 5 > 0, 4] = np.nan
     windows = windows_of(dataclasses.replace(log, keypoints=points))
     assert windows.name == ("0", "1", "3") and windows.left_out == ("file 2 from 0 s",)
     error, none = np.full(3, 0.004), np.zeros(3, bool)
@@ -154,6 +154,29 @@ def test_windows_that_never_show_all_keypoints_are_counted():
         and "file 2 from 0 s." in sentence
     )
     assert windows_of(log).left_out == ()
+
+
+def test_markers_that_are_often_hidden_for_a_moment_leave_a_window_where_it_begins():
+    log = cases.recording()
+    whole, points = windows_of(log), log.keypoints.copy()
+    for k in range(2, 8):
+        points[:, 1 + (k % 3) : -1 : 3, k] = np.nan
+    windows = windows_of(dataclasses.replace(log, keypoints=points))
+    assert windows.begin.tolist() == [0, 0, 0, 0] and windows.left_out == ()
+    np.testing.assert_allclose(windows.keypoints[:, :2], whole.keypoints[:, :2], atol=5e-4)
+    assert np.isnan(windows.observed[:, 2:]).any()
+
+
+def test_what_is_shorter_than_a_window_is_said():
+    log = cases.recording()
+    length = log.episode_length.copy()
+    length[0] = 40
+    windows = windows_of(dataclasses.replace(log, episode_length=length))
+    error, none = np.full(3, 0.004), np.zeros(3, bool)
+    (sentence,) = accident_sentences(none, error, windows, none)
+    assert sentence.startswith("12 % of the samples are in episodes, or ends of episodes, shorter than 1 s")
+    with pytest.raises(ValueError, match=r"The longest episode is 0.78 s long, expected at least 1 s\. Record longer"):
+        windows_of(dataclasses.replace(log, episode_length=np.full_like(length, 40)))
 
 
 def torn(episodes: int = 4):

@@ -12,6 +12,7 @@ import itertools
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.interpolate import CubicSpline
 
 from cablejax.arrays import positions_at, stretches
 from cablejax.cable_length import coordinate_noise
@@ -115,6 +116,26 @@ def _require_grippers(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | No
                 f"Gripper {gripper} {what}. Both ends must be known: name the columns or topic of its pose, or two "
                 "markers that are on it."
             )
+
+
+def bridged(points: Float[np.ndarray, "T F 3"], interval: float) -> Float[np.ndarray, "T F 3"]:
+    """The same with gaps of up to `FILLED` of each marker filled by a smooth curve through what is seen of it.
+
+    Args:
+        points: [m], NaN = not observed.
+        interval: between samples [s].
+    """
+    filled = points.copy()
+    for k in range(points.shape[1]):
+        seen = np.flatnonzero(np.isfinite(points[:, k]).all(axis=-1))
+        if len(seen) < 2:
+            continue
+        curve = CubicSpline(seen, points[seen, k])
+        for last, following in itertools.pairwise(seen.tolist()):
+            if 1 < following - last <= FILLED / interval + 1e-9:
+                between = np.arange(last + 1, following)
+                filled[between, k] = curve(between)
+    return filled
 
 
 def _fillable(take: Take) -> float:

@@ -10,11 +10,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cablejax.spatial.windows import Windows
+from cablejax.recordings.gaps import FILLED
+from cablejax.spatial.windows import SHORTEST, Windows
 
 _TIMES = 10.0
 _MOST = 0.1
 _SHOWN = 5
+# Part of the samples that may be left out without a word.
+_SHORT = 0.01
 
 
 def off(error: Float[np.ndarray, "W"]) -> Bool[np.ndarray, "W"]:
@@ -96,12 +99,18 @@ def accident_sentences(
             shown = ", ".join(_window(windows, i, float(error[i]), torn=bool(torn[i])) for i in index[:_SHOWN])
             more = f" and {len(index) - _SHOWN} more" if len(index) > _SHOWN else ""
             result.append(f"{len(index)} of {len(windows)} windows {words}: file {shown}{more}. {advice}")
+    if windows.short > _SHORT:
+        result.append(
+            f"{100 * windows.short:.0f} % of the samples are in episodes, or ends of episodes, shorter than "
+            f"{SHORTEST:g} s, and were left out."
+        )
     if windows.left_out:
         count = len(windows.left_out)
         more = f" and {count - _SHOWN} more" if count > _SHOWN else ""
         result.append(
-            f"{count} more windows were left out, since none of their seconds begins with two samples of all "
-            f"keypoints, or too little is observed later: {', '.join(windows.left_out[:_SHOWN])}{more}."
+            f"{count} more windows were left out, since none of their seconds begins with two samples of all keypoints "
+            f"(gaps of up to {FILLED:g} s are filled), or too little is observed later: "
+            f"{', '.join(windows.left_out[:_SHOWN])}{more}."
         )
     return result
 

@@ -15,6 +15,7 @@ from cablejax.diagnose.noise import noise_floor
 from cablejax.gaplog import labels
 from cablejax.log_geometry import cable_fault
 from cablejax.poses import rotated
+from cablejax.recordings.gaps import FILLED, bridged
 from cablejax.spatial.grips import clamps, frames_of, held_keypoints, rolls_observed
 from cablejax.types import GapLog
 
@@ -22,7 +23,8 @@ WINDOW = 5.0
 """Length of a window [s]: so far ahead the simulator predicts from two observations."""
 FITTED = slice(2, None, 4)
 """Samples of a window that fits look at: every fourth, after the two that the simulation begins from."""
-_SHORTEST = 1.0
+SHORTEST = 1.0
+"""Length of the shortest window [s]."""
 # Part of a window that must be recorded for it to be a whole one.
 _WHOLE = 0.8
 # Clamps that scatter by less than this from one sample to the next [m] stay as they were measured.
@@ -57,6 +59,7 @@ class Windows:
             coordinate [m].
         left_out: where the log has windows without a second that begins with two samples of all keypoints, or in which
             fits see nothing later, in words.
+        short: part of the log's samples that are in stretches shorter than a window may be.
     """
 
     keypoints: Float[np.ndarray, "W T F 3"]
@@ -78,6 +81,7 @@ class Windows:
     rolls: bool = False
     smoothed: float = 0.0
     left_out: tuple[str, ...] = ()
+    short: float = 0.0
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -179,9 +183,17 @@ def windows_of(log: GapLog) -> Windows:
     recording = labels(log, "recording")
     groups = {r: i for i, r in enumerate(dict.fromkeys(recording))}
     files, splits = labels(log, "file", "take"), labels(log, "split", default="")
-    pieces, left_out = _pieces(points[:, :, free], log.episode_length, samples, math.ceil(_SHORTEST / interval - 1e-9))
+    least = math.ceil(SHORTEST / interval - 1e-9)
+    begins = np.stack([bridged(one, interval) for one in points[:, :, free]])
+    pieces, left_out = _pieces(points[:, :, free], begins, log.episode_length, samples, least)
     if not pieces:
-        raise ValueError(f"No episode has a stretch of {_SHORTEST:g} s whose first two samples show all keypoints.")
+        longest = (int(log.episode_length.max()) - 1) * interval
+        raise ValueError(
+            f"The longest episode is {longest:.3g} s long, expected at least {SHORTEST:g} s. Record longer motions."
+            if log.episode_length.max() < least
+            else f"No episode has a stretch of {SHORTEST:g} s whose first two samples show all keypoints, or miss "
+            f"them for at most {FILLED:g} s. Record with more cameras, or leave out the keypoints that are seen least."
+        )
 
     def cut(array):
         rows = []
@@ -191,8 +203,10 @@ def windows_of(log: GapLog) -> Windows:
         return np.stack(rows)
 
     mask = np.stack([np.arange(samples) < size for _, _, size in pieces])
+    keypoints = cut(points[:, :, free])
+    keypoints[:, :2] = np.where(np.isfinite(keypoints[:, :2]), keypoints[:, :2], cut(begins)[:, :2])
     windows = Windows(
-        keypoints=cut(points[:, :, free]),
+        keypoints=keypoints,
         position=cut(clamp),
         frames=cut(frames),
         valid=mask,
@@ -210,15 +224,23 @@ def windows_of(log: GapLog) -> Windows:
         gravity=tuple(log.meta["gravity_m_per_s2"]),
         rolls=rolls_observed(log),
         smoothed=float(np.sqrt((taken**2).mean(axis=-1)).max()),
+        short=_short(log.episode_length, samples, least),
         left_out=tuple(f"file {files[e]} from {begin * interval:.3g} s" for e, begin in left_out),
     )
     return dataclasses.replace(windows, trust=np.where(windows.torn, _TORN, 1.0))
 
 
 def _pieces(
-    points: Float[np.ndarray, "E T F 3"], length: Int[np.ndarray, "E"], samples: int, least: int
+    points: Float[np.ndarray, "E T F 3"],
+    begins: Float[np.ndarray, "E T F 3"],
+    length: Int[np.ndarray, "E"],
+    samples: int,
+    least: int,
 ) -> tuple[list[tuple[int, int, int]], list[tuple[int, int]]]:
-    """Windows (episode, first sample, samples), and those left out: no two whole samples, or fits see nothing later."""
+    """Windows (episode, first sample, samples), and those left out: no two whole samples, or fits see nothing later.
+
+    Where nowhere in a window two samples are observed as a whole, it begins with two that are in `begins`.
+    """
     pieces, left_out = [], []
     for e, count in enumerate(length):
         for begin in range(0, int(count), samples):
@@ -226,14 +248,26 @@ def _pieces(
             if end - begin < least:
                 continue
             # a window begins where its initial shape and velocity are known
-            seen = np.asarray(np.isfinite(points[e, begin:end]).all(axis=(1, 2)))
-            whole = np.flatnonzero(seen[:-1] & seen[1:])
-            start = begin + int(whole[0]) if len(whole) else end
+            starts = (_first_pair(each[e, begin:end]) for each in (points, begins))
+            start = begin + next((at for at in starts if at <= end - begin - least), end - begin)
             if end - start >= least and np.isfinite(points[e, start:end][FITTED]).any():
                 pieces.append((e, start, end - start))
             else:
                 left_out.append((e, begin))
     return pieces, left_out
+
+
+def _short(length: Int[np.ndarray, "E"], samples: int, least: int) -> float:
+    """Part of the samples in episodes, or ends of episodes, that are shorter than `least` samples."""
+    rest = length % samples
+    return float(rest[rest < least].sum() / length.sum())
+
+
+def _first_pair(points: Float[np.ndarray, "T F 3"]) -> int:
+    """The first of two samples that have all keypoints; the number of samples where there are none."""
+    seen = np.asarray(np.isfinite(points).all(axis=(1, 2)))
+    both = seen[:-1] & seen[1:]
+    return int(both.argmax()) if both.any() else len(points)
 
 
 def _sample_interval(log: GapLog) -> float:
