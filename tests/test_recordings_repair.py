@@ -444,6 +444,8 @@ def test_nothing_left_between_gaps_is_refused():
     points[np.arange(200) % 16 < 9, 0] = np.nan
     with pytest.raises(ValueError, match=r"no stretch of at least 0\.5 s"):
         cut_at_gaps((take(points),), HELD)
+    with pytest.raises(ValueError, match=r"no stretch of at least 0\.5 s .* And [0-9]+ more\.$"):
+        cut_at_gaps(tuple(take(points, str(k)) for k in range(9)), HELD)
 
 
 def test_millimetres_are_recognised_or_refused():

@@ -41,6 +41,8 @@ times the noise of a coordinate."""
 _HELD_SAMPLES, _HELD_PART = 3, 0.2
 # In so many of its steps a slower tracker repeats as often as usual, give or take one.
 _REGULAR = 0.9
+# Findings that an error lists.
+_TOLD = 6
 
 
 def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) -> tuple[tuple[Take, ...], list[str]]:
@@ -97,9 +99,10 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
     if not parts:
         steps = np.concatenate([np.diff(take.time) for take in takes])
         apart = f" Its samples are {np.median(steps):.3g} s apart: check the unit of time." if len(steps) else ""
+        more = f" And {len(reports) - _TOLD} more." if len(reports) > _TOLD else ""
         raise ValueError(
             f"Between its gaps the recording has no stretch of at least {SHORTEST:g} s and {SHORTEST_SAMPLES} "
-            f"samples in which both gripper poses are known.{apart} Found: " + " ".join(reports)
+            f"samples in which both gripper poses are known.{apart} Found: {' '.join(reports[:_TOLD])}{more}"
         )
     return tuple(parts), reports
 
