@@ -95,6 +95,7 @@ def test_a_cable_that_cannot_be_scored_is_named_and_the_others_are_read(tmp_path
     assert "This is a branched cable" in refused["tree"]
     text = page({"rope": score(False)}, {}, "errors.png", "where", Notes({"rope": ["Mended."]}, refused))
     assert "- tree is not scored. This is a branched cable" in text and "- rope: Mended." in text
+    assert text.index("One procedure") < text.index("## Recordings") < text.index("\n---\n")
     (tmp_path / "rope.npz").unlink()
     with pytest.raises(ValueError, match=r"No cable in .* can be scored: .* This is a branched cable"):
         script._read(tmp_path)

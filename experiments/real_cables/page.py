@@ -137,7 +137,7 @@ def page(scores: Mapping[str, Any], published: Published, picture: str, made: st
             *_on_eval({c: scores[c] for c in scored}, published, learned, best),
             "",
         ]
-    lines += [*_step_by_step(scores), *_left_out(scores), *_noted(notes)]
+    lines += [*_step_by_step(scores), *_left_out(scores)]
     lines += [
         "One procedure with one set of constants for all cables. Ridge residual and graph network read the clamps' "
         "history of 0.4 s and the simulated markers, in a frame that moves with the clamps; regularisation, number of "
@@ -145,6 +145,7 @@ def page(scores: Mapping[str, Any], published: Published, picture: str, made: st
         "ridge on top of the graph network is fitted to markers that were corrected by networks trained on other "
         "recordings.",
         "",
+        *_noted(notes),
         "---",
         "",
         f"Made by `python experiments/30_real_cables.py --data DEFORM`. {made}",
@@ -307,7 +308,7 @@ def _noted(notes: Notes) -> list[str]:
     ]
     if not refused + repairs:
         return []
-    return ["## Repairs before the scores", "", *refused, *repairs, ""]
+    return ["## Recordings", "", *refused, *repairs, ""]
 
 
 def _ratio(one: float, other: float) -> float:
