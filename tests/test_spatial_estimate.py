@@ -15,6 +15,7 @@ from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import FINER, TWISTED, SpatialCable
+from cablejax.spatial.diagnose import _caveats
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, restarts
 from cablejax.spatial.identify import Identified, TimeSteps, _for_predictions, layout_of
 from cablejax.spatial.named import named_effects, parameters_of, quantities_of, with_both_drags
@@ -211,6 +212,14 @@ def _valued(everything, values):
     one, layout = everything.explanation, everything.layout
     other = explanation(*((term.effect, term.variant, values[layout.slots(term.effect.name)]) for term in one.terms))
     return dataclasses.replace(everything, explanation=one.moved(other.z))
+
+
+def test_values_that_the_simulators_own_error_may_hide_are_said_to_be_unsure(found):
+    def unsure(own, *, hides):
+        every = _caveats(found.cable.windows, 0, found, own, hides=hides)
+        return [words for words in every if "more than their intervals: record" in words]
+
+    assert len(unsure(0.06, hides=True)) == 1 and not unsure(0.06, hides=False) and not unsure(1e-4, hides=True)
 
 
 def test_a_clamp_beyond_the_last_keypoint_is_no_keypoint(found, everything):

@@ -120,7 +120,7 @@ def diagnose_space(
             *repairs,
             *shifted,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(windows, left_out, found, own),
+            *_caveats(windows, left_out, found, own, hides=verdict == "none"),
         ),
         log=log,
         nominal=nominal,
@@ -209,7 +209,7 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
     return tuple(ranked)
 
 
-def _caveats(windows, left_out, found, own) -> tuple[str, ...]:
+def _caveats(windows, left_out, found, own, *, hides: bool) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight. Stiffness, drag and added masses are estimated "
         "relative to the linear density of the cable with its markers, and a wrong density (linear_density) is not "
@@ -245,6 +245,7 @@ def _caveats(windows, left_out, found, own) -> tuple[str, ...]:
             "Noise in the first two samples of each window and the edges of the simulated cable alone cause errors of "
             f"{1e3 * own:.1f} mm. They are part of the gap after; errors of up to 1.5 times this size do not count as "
             "a gap."
+            + (" The values fitted to such motion may be off by more than their intervals: record slower ones." * hides)
         )
     if windows.smoothed:
         result.append(

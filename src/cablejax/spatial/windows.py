@@ -187,13 +187,7 @@ def windows_of(log: GapLog) -> Windows:
     begins = np.stack([bridged(one, interval) for one in points[:, :, free]])
     pieces, left_out = _pieces(points[:, :, free], begins, log.episode_length, samples, least)
     if not pieces:
-        longest = (int(log.episode_length.max()) - 1) * interval
-        raise ValueError(
-            f"The longest episode is {longest:.3g} s long, expected at least {SHORTEST:g} s. Record longer motions."
-            if log.episode_length.max() < least
-            else f"No episode has a stretch of {SHORTEST:g} s whose first two samples show all keypoints, or miss "
-            f"them for at most {FILLED:g} s. Record with more cameras, or leave out the keypoints that are seen least."
-        )
+        raise ValueError(_no_window(int(log.episode_length.max()), least, interval))
 
     def cut(array):
         rows = []
@@ -257,6 +251,17 @@ def _pieces(
     return pieces, left_out
 
 
+def _no_window(longest: int, least: int, interval: float) -> str:
+    """Why there is no window, from the samples of the longest episode, and what to do."""
+    if longest < least:
+        long = f"{(longest - 1) * interval:.3g} s long, expected at least {SHORTEST:g} s"
+        return f"The longest episode is {long}. Record longer motions."
+    return (
+        f"No episode has a stretch of {SHORTEST:g} s whose first two samples show all keypoints, or miss them for at "
+        f"most {FILLED:g} s. Record with more cameras, or leave out the keypoints that are seen least."
+    )
+
+
 def _short(length: Int[np.ndarray, "E"], samples: int, least: int) -> float:
     """Part of the samples in episodes, or ends of episodes, that are shorter than `least` samples."""
     rest = length % samples
@@ -266,8 +271,7 @@ def _short(length: Int[np.ndarray, "E"], samples: int, least: int) -> float:
 def _first_pair(points: Float[np.ndarray, "T F 3"]) -> int:
     """The first of two samples that have all keypoints; the number of samples where there are none."""
     seen = np.asarray(np.isfinite(points).all(axis=(1, 2)))
-    both = seen[:-1] & seen[1:]
-    return int(both.argmax()) if both.any() else len(points)
+    return int(np.append(seen[:-1] & seen[1:], True).argmax()) if seen.any() else len(points)
 
 
 def _sample_interval(log: GapLog) -> float:
