@@ -127,6 +127,17 @@ def test_a_hold_too_short_tells_nothing():
     assert not noise_floor(points + white(7e-4), flags).from_holds
 
 
+@pytest.mark.parametrize("std", [2e-4, 2e-3])
+def test_motion_between_samples_a_second_apart_is_no_noise(std):
+    """Third differences of such samples are motion; holds of three samples show the level."""
+    points, flags = short_holds()
+    seldom, flags = (points + white(std))[:, ::5], flags[:, ::5]
+    assert noise_floor(seldom, None).std[0] > 1.5 * std
+    floor = noise_floor(seldom, flags)
+    assert floor.from_holds and not floor.correlation.any()
+    np.testing.assert_allclose(floor.std, std, rtol=0.05)
+
+
 @pytest.mark.parametrize("with_holds", [True, False])
 def test_one_noisier_keypoint_has_its_own_level(with_holds):
     points, flags = held()

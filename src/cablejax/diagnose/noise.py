@@ -11,8 +11,12 @@ from jaxtyping import Bool, Float
 
 from cablejax.arrays import stretches
 
-# Shortest hold that is used, in samples.
+# Shortest hold that shows how noise is correlated in time, in samples.
 _SHORTEST_HOLD = 10
+# Shortest hold that shows its level: of three samples a line leaves one.
+_THREE = 3
+# Levels that differ by less are the same.
+_SAME = 0.1
 _LAGS = 5
 # A gripper that is so far from where it is for most of a hold moves the cable [lengths of it]: further than one goes
 # that lags.
@@ -62,7 +66,8 @@ def noise_floor(
     smooths, its level is what that process needs to leave such scatter about a line (`_first_order`).
 
     If the noise in the holds is white, third differences of the whole recording sharpen its level: there are many more
-    of them, and no cable moves by jerks that fast. Keypoints share one level unless one is clearly noisier.
+    of them, and no cable moves by jerks that fast. It does between samples a second apart, where holds are short: then
+    the level is that of holds of three samples or more. Keypoints share one level unless one is clearly noisier.
 
     Args:
         keypoints: N points of D coordinates that have the same noise, NaN = not observed.
@@ -74,10 +79,13 @@ def noise_floor(
         ValueError: fewer than 20 observed samples of every keypoint, or no noise at all.
     """
     rapid, n_rapid = _differences(keypoints, order)
-    level, held = _pooled(rapid, n_rapid), None if hold is None else _held(keypoints, hold)
+    level, held = _pooled(rapid, n_rapid), None if hold is None else _held(keypoints, hold, _SHORTEST_HOLD)
+    brief = _held(keypoints, hold, _THREE) if hold is not None and held is None else None
+    if brief and math.sqrt(_pooled(*brief[:2]) / max(level, 1e-30)) < 1.0 - _SAME:
+        held = brief
     variance, count, correlation, restless = held or (rapid, n_rapid, np.zeros(_LAGS), 0)
     # white noise has one level at all frequencies; a jerky recording does not
-    if held and abs(correlation[0]) < _scattered(count) and abs(level / _pooled(variance, count) - 1) < 0.1:
+    if held and abs(correlation[0]) < _scattered(count) and abs(level / _pooled(variance, count) - 1) < _SAME:
         variance, count = rapid, n_rapid
     if count.max() < 20:
         raise ValueError(
@@ -146,16 +154,17 @@ def _differences(keypoints, order: int):
     return variance, count
 
 
-def _held(keypoints, hold):
+def _held(keypoints, hold, shortest: int):
     """Variance and count per keypoint, pooled autocorrelation, and holds left out; None without a hold.
 
-    A hold that scatters far more than the others is one in which the cable moves.
+    Holds have at least `shortest` samples; the noise of those too short to show correlations is taken to be white. A
+    hold that scatters far more than the others is one in which the cable moves.
     """
     holds = []
     for episode, flags in zip(keypoints, hold, strict=True):
         for begin, end in stretches(flags):
-            if end - begin >= _SHORTEST_HOLD:
-                holds.append((end - begin, *_about_lines(episode[begin:end])))
+            if end - begin >= shortest:
+                holds.append((end - begin, *_about_lines(episode[begin:end], shortest)))
     usual = [float(squares.sum() / count.sum()) for _, squares, count, _ in holds if count.sum() > 0]
     largest = _RESTLESS * float(np.median(usual)) if usual else 0.0
     kept = [one for one in holds if 0 < one[1].sum() <= largest * one[2].sum()]
@@ -165,6 +174,8 @@ def _held(keypoints, hold):
     if count.max() < 20:
         return None
     variance = squares / np.maximum(count, 1)
+    if shortest < _SHORTEST_HOLD:
+        return squares / np.maximum(count, 1), count, np.zeros(_LAGS), len(usual) - len(kept)
     level = squares.sum() / count.sum()
     correlation = products[:, 0] / np.maximum(products[:, 1], 1) / level
     slow = _first_order(correlation, collections.Counter(min(one[0], _LONG) for one in kept), _scattered(count))
@@ -172,19 +183,22 @@ def _held(keypoints, hold):
     return variance * factor, count, correlation, len(usual) - len(kept)
 
 
-def _about_lines(keypoints: Float[np.ndarray, "T N D"]):
-    """Squares about a line and their number, per keypoint, and products at lags 1, 2, ... with theirs, of one hold."""
+def _about_lines(keypoints: Float[np.ndarray, "T N D"], shortest: int):
+    """Squares about a line and their number, per keypoint, and products at lags 1, 2, ... with theirs, of one hold.
+
+    Keypoints that are observed in fewer than `shortest` of its samples are left out.
+    """
     t, (_, n_points, axes) = np.arange(len(keypoints), dtype=float), keypoints.shape
     squares, count, products = np.zeros(n_points), np.zeros(n_points), np.zeros((_LAGS, 2))
     for n, axis in np.ndindex(n_points, axes):
         values = keypoints[:, n, axis]
         seen = np.isfinite(values)
-        if seen.sum() < _SHORTEST_HOLD:
+        if seen.sum() < shortest:
             continue
         rest = values - np.polyval(np.polyfit(t[seen], values[seen], 1), t)
         squares[n] += np.nansum(rest**2)
         count[n] += seen.sum() - 2
-        for lag in range(1, _LAGS + 1):
+        for lag in range(1, min(_LAGS + 1, len(rest))):
             pair = rest[lag:] * rest[:-lag]
             products[lag - 1] += np.nansum(pair), np.isfinite(pair).sum()
     return squares, count, products
