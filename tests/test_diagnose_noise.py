@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from cablejax.diagnose import explanation, planar_run
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.case import Case, calibrated
-from cablejax.diagnose.caveats import caveats_of, silent_motions
+from cablejax.diagnose.caveats import caveats_of, rarely_left, silent_motions
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import NamedEffect
 from cablejax.diagnose.fit import Fit
@@ -346,6 +346,18 @@ def test_a_motion_that_is_no_evidence_of_a_gap_is_reported():
     assert not list(silent_motions(facts, dataclasses.replace(none, verdict="unknown"), Calibration()))
     calm = dataclasses.replace(fit, sse=facts.count * 1.0)
     assert not list(silent_motions(facts, dataclasses.replace(none, best=calm), Calibration()))
+
+
+def test_a_name_that_leaves_more_of_the_gap_than_correct_ones_has_a_caveat():
+    """Such as two effects that together resemble a spring that pulls the cable."""
+    fit = Fit(explanation(), np.zeros(4), np.zeros((4, 0)), np.zeros((4, 0, 0)))
+    named = Conclusion("named", fit, (), (), (), 0.94, leftover_p=5 / 81)
+    (text,) = rarely_left(named)
+    assert text.startswith("Of the correct explanations on labelled logs, 6 % leave as large a part of the gap as this")
+    assert list(rarely_left(dataclasses.replace(named, verdict="ambiguous"))) == [text]
+    assert not list(rarely_left(dataclasses.replace(named, leftover_p=0.3)))
+    assert not list(rarely_left(dataclasses.replace(named, verdict="named+unknown"))), "the page says how much is left"
+    assert not list(rarely_left(Conclusion("none", fit, (), (), (), 0.0)))
 
 
 def test_what_stands_beside_an_unknown_cause_makes_the_gap_smaller():

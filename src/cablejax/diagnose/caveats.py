@@ -18,6 +18,8 @@ from cablejax.diagnose.rounds import UNLIKELY, Rounds
 
 # Reported: holds in which keypoints scatter by this many times what they do between samples.
 _SCATTERED = 1.5
+# Reported: a named cause that leaves as much of the gap as only this share of correct ones.
+_RARE = 0.1
 
 
 def contradictions(rounds: Rounds | None) -> tuple[str, ...]:
@@ -41,6 +43,17 @@ def silent_motions(evidence: Evidence, conclusion: Conclusion, calibration: Cali
             f"{1e3 * gap:.2g} mm per coordinate, and may be off by {1e3 * own:.2g} mm there without any effect. Small "
             "errors grow in this motion, for example where the cable snaps over or a wrong pose strains it. Check the "
             "episode, or record a calmer motion."
+        )
+
+
+def rarely_left(conclusion: Conclusion) -> Iterator[str]:
+    """That correct causes seldom leave as much of the gap as the one that is named, if they do."""
+    rare = conclusion.leftover_p
+    if conclusion.verdict in ("named", "ambiguous") and rare is not None and rare <= _RARE:
+        yield (
+            f"Of the correct explanations on labelled logs, {100 * rare:.0f} % leave as large a part of the gap as "
+            "this one. The cause may be outside the library and only resemble what is named, or one more effect may be "
+            "there: look for it on the set-up, and record more motions before you act on the name."
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from cablejax.diagnose.actuation_verdict import negligible, with_arms
 from cablejax.diagnose.belief import Calibration, excess
 from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case, calibrated
-from cablejax.diagnose.caveats import caveats_of, contradictions, silent_motions
+from cablejax.diagnose.caveats import caveats_of, contradictions, rarely_left, silent_motions
 from cablejax.diagnose.conclude import Conclusion, sentence
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NextMotion
 from cablejax.diagnose.evidence import Evidence
@@ -91,6 +91,7 @@ def diagnose(
         following, none_kept = _following(judge, None if bounds is None else DesignConfig())
     repaired, rounds = case.recording.as_log(case.log.meta), rounds_of(case.log, found)
     caveats = [*contradictions(rounds), *silent_motions(found.evidence, conclusion, calibration)]
+    caveats += rarely_left(conclusion)
     caveats += [*caveats_of(case, calibration, length, stated, commissioned=bool(commissioning)), *none_kept]
     fields = Examined(found, conclusion, reference, after, gap).fields()
     if case.arms.strays(negligible(calibration, case.config.cable.length)) and alone.verdict in _ARMS_TOO:
