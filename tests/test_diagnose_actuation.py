@@ -92,6 +92,8 @@ def test_a_lag_is_told_by_its_total(delay, slow):
     assert pure.value == pytest.approx(delay, abs=0.02)
     assert total.value == pytest.approx(delay + slow, abs=0.02) and total.unit == pure.unit == "s"
     assert low - 0.01 <= delay + slow <= high + 0.01
+    low, high = pure.ci90
+    assert low - 0.01 <= delay <= high + 0.01 and high - low > 5e-4, "no delay is known to the last digit"
     assert result.leftover < 0.1 * result.deviation
 
 

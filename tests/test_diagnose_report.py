@@ -21,12 +21,13 @@ from cablejax.diagnose.safe_motions import safe_motions
 from cablejax.diagnose.verdict_json import verdict_json, write_verdict
 from cablejax.diagnose.where import localise
 from cablejax.effects import OUTSIDE
+from cablejax.effects.given import OPTIONAL
 from cablejax.gaplog import write_gap_log
 from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import where_figure, worst_moment
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.diagnosis_sections import detail_tables, ranking_note
-from cablejax.report.effect_words import effect_place, instruction, quantity, share
+from cablejax.report.effect_words import effect_place, instruction, parameter_title, quantity, share
 from cablejax.report.motion_figures import motion_figure
 from cablejax.report.spatial_figures import recording_ends
 from cablejax.simulate.rod import Rod
@@ -235,6 +236,11 @@ class _Outside(html.parser.HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.fetched += [v for name, v in attrs if name in ("src", "href", "xlink:href", "data") and v]
+
+
+@pytest.mark.parametrize("name", sorted(OPTIONAL))
+def test_a_parameter_that_an_effect_may_have_is_reported_in_words(name):
+    assert parameter_title(name) != name.replace("_", " ")
 
 
 def test_page_says_the_verdict_and_what_belongs_to_it(written):

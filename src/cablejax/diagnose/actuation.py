@@ -29,6 +29,8 @@ NEGLIGIBLE = 2e-4
 _EXPLAINED = 0.25
 # An effect that leaves more of it than this is not named: a backlash looks like a lag, and leaves more.
 _TELLING = 0.5
+# Of finite differences by gain and lags [1 and s].
+_STEP = 1e-4
 ARMS = ("actuation_gain", "actuation_lag")
 """Names of the effects of the arms."""
 _GAIN, _LAG = ARMS
@@ -123,14 +125,18 @@ class _Arms:
 
     def fit(self, effects: tuple[str, ...], starts) -> Any:
         """The best of scipy's least squares results."""
-        bounds = _bounds(effects)
+        bounds = tuple(zip(*_bounds(effects), strict=True))
+
+        def off(theta):
+            return self.off(self.predicted(effects, theta)).ravel() / _ENCODER_NOISE
+
+        def slopes(theta):
+            # scipy's own steps are relative: next to a delay of 0 they vanish, and its interval with them
+            return np.stack([(off(theta + row) - off(theta)) / _STEP for row in _STEP * np.eye(len(theta))], axis=-1)
+
+        # scipy takes a function, of which its types do not know
         results = [
-            scipy.optimize.least_squares(
-                lambda theta: self.off(self.predicted(effects, theta)).ravel() / _ENCODER_NOISE,
-                start,
-                bounds=tuple(zip(*bounds, strict=True)),
-                diff_step=1e-4,
-            )
+            scipy.optimize.least_squares(off, start, jac=slopes, bounds=bounds)  # pyright: ignore[reportArgumentType]
             for start in starts
         ]
         return min(results, key=lambda result: result.cost)

@@ -58,6 +58,7 @@ _PARAMETERS: dict[str, str] = {
     "transition_curvature_per_m": "curvature over which it builds up",
     "stiffness_n": "axial stiffness EA",
     "coefficient": "Coulomb coefficient",
+    "static_excess": "excess of static friction, relative",
     "x_m": "x on the table",
     "y_m": "y on the table",
     "hardening": "hardening beyond the yield",
@@ -68,11 +69,13 @@ _PARAMETERS: dict[str, str] = {
     "mass_kg": "mass",
     "gripper": "gripper",
     "time_s": "time",
+    "delay_s": "pure delay, a part of this time",
     "distance_m": "change of the free length",
     "stiffness_n_m_per_rad": "stiffness of the grasp",
     "gain": "gain",
     "scale": "scale",
     "index": "keypoint",
+    "across": "along the cable (0) or across it (1)",
     "offset_m": "offset",
 }
 
