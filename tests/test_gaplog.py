@@ -201,10 +201,14 @@ def test_wrong_arrays_are_named(log):
             r"first to the last sample of episode 0 is .*, expected a number from 0 to",
         ),
         (0.1 * np.arange(8) + 1e3 * (np.arange(8) > 4), "pause of 1000 s after sample 4 of episode 0, where 0.1 s"),
-        (1e-9 * np.arange(8), r"usual time between samples of episode 0 is 1e-09, expected a number from 0\.0001"),
+        (
+            1e-9 * np.arange(8),
+            r"usual time between samples of episode 0 is 1e-09, expected a number from 0\.0001.*unit`\)\?$",
+        ),
+        (2.0 * np.arange(8), r"usual time between samples of episode 0 is 2\.0.* record at least once a second"),
         (1.7e9 + 0.1 * np.arange(8), "first time of episode 0 is 1700000000.0, .* subtract the first of each episode"),
     ],
-    ids=["a jump of 1e9 s", "a jump of 1000 s", "steps of 1e-9 s", "since 1970"],
+    ids=["a jump of 1e9 s", "a jump of 1000 s", "steps of 1e-9 s", "steps of 2 s", "since 1970"],
 )
 def test_a_clock_that_no_recording_has_is_refused(tmp_path, log, time, message):
     times = log.time.copy()

@@ -111,7 +111,8 @@ def _check_clock(time: Float[np.ndarray, " T"], which: str) -> None:
     usual, advice = round(float(np.median(step)), 9), "Is the time in seconds (in a layout: `time_unit`)?"
     begin = "Times are seconds from the episode's start: subtract the first of each episode."
     require(abs(float(time[0])), "duration", f"The first time {which}", begin)
-    require(usual, "sample_interval", f"The usual time between samples {which}", advice)
+    slow = " If it is, record at least once a second: between samples poses are interpolated."
+    require(usual, "sample_interval", f"The usual time between samples {which}", advice + (slow if usual > 1 else ""))
     require(float(time[-1] - time[0]), "duration", f"The time from the first to the last sample {which}", advice)
     if time[-1] - time[0] > _LOST * usual * len(time):
         raise ValueError(
