@@ -73,10 +73,12 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, DeformRecordings], dict[str, 
     for name, path in cables_in(folder).items():
         try:
             recordings = dataclasses.replace(read_deform(path), name=name)
-            read[name], repairs[name] = repaired_blocks(recordings)
-            protocol_windows(read[name])
+            recordings, found = repaired_blocks(recordings)
+            windows = protocol_windows(recordings)
+            if len(windows) == 1 or windows.split.count("eval") == len(windows) - 1:
+                raise ValueError("One block may be fitted, expected at least two, so that one can be left out.")
+            read[name], repairs[name] = recordings, found
         except ValueError as error:
-            read.pop(name, None)
             refused[name] = str(error)
             print(f"{name} is not scored: {error}", file=sys.stderr, flush=True)
     if not read:

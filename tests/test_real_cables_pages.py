@@ -58,8 +58,6 @@ def test_windows_of_recordings_with_gaps():
     np.testing.assert_allclose(windows.arclength, whole.arclength, atol=1e-3)
     np.testing.assert_allclose(windows.position[1, 50:55], whole.position[1, 50:55], atol=3e-3)
     assert np.isnan(windows.observed[2, 80:90, 1:4]).all()
-    with pytest.raises(ValueError, match=r"one block may be fitted, expected at least two"):
-        protocol_windows(recordings.chosen(np.array([0])))
     points[:, :, 3] = np.nan
     with pytest.raises(ValueError, match="no block begins"):
         protocol_windows(recordings)
@@ -90,9 +88,11 @@ def test_a_cable_that_cannot_be_scored_is_named_and_the_others_are_read(tmp_path
     branch = good.keypoints[:, :, 4:5] - np.array([0.0, 0.0, 0.08]) * np.arange(1, 4)[:, None]
     np.savez(tmp_path / "tree.npz", keypoints=np.concatenate([good.keypoints, branch], axis=2), **fields)
     (tmp_path / "torn.npz").write_bytes(b"PK")
+    one = {name: value[:1] for name, value in {"keypoints": good.keypoints, **fields}.items() if name != "dt"}
+    np.savez(tmp_path / "single.npz", dt=good.dt, **one)
     read, repairs, refused = script._read(tmp_path)
-    assert list(read) == ["rope"] and repairs == {"rope": []} and list(refused) == ["torn", "tree"]
-    assert "This is a branched cable" in refused["tree"]
+    assert list(read) == ["rope"] and repairs == {"rope": []} and list(refused) == ["single", "torn", "tree"]
+    assert "This is a branched cable" in refused["tree"] and "One block may be fitted" in refused["single"]
     text = page({"rope": score(False)}, {}, "errors.png", "where", Notes({"rope": ["Mended."]}, refused))
     assert "- tree is not scored. This is a branched cable" in text and "- rope: Mended." in text
     assert text.index("One procedure") < text.index("## Recordings") < text.index("\n---\n")

@@ -58,8 +58,7 @@ def protocol_windows(recordings: DeformRecordings) -> Windows:
         recordings: checked and repaired, see `repaired_blocks`.
 
     Raises:
-        ValueError: neighbouring markers are never observed together, no block begins with two whole samples, or only
-            one may be fitted.
+        ValueError: neighbouring markers are never observed together, or no block begins with two whole samples.
     """
     points = recordings.keypoints
     held, count = _followed(points[:, :, _HELD], recordings.dt)
@@ -78,10 +77,6 @@ def protocol_windows(recordings: DeformRecordings) -> Windows:
         k = int(unseen.argmax())
         raise ValueError(f"{recordings.name}: markers {k} and {k + 1} are never observed together: leave one out.")
     lengths = np.nanquantile(spacing.reshape(-1, spacing.shape[-1]), _STRAIGHT, axis=0)[1:-1]
-    if fitted[whole].sum() == 1 or whole.sum() == 1:
-        raise ValueError(
-            f"{recordings.name}: one block may be fitted, expected at least two, so that one can be left out of a fit."
-        )
     every = Windows(
         keypoints=points[:, :, 2:-2],
         position=held[:, :, [1, 2]],

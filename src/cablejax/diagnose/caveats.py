@@ -97,7 +97,7 @@ def caveats_of(
         if off.max() > MARGIN:
             caveats.append(
                 f"Motions were not executed as commanded: the grippers of episode {int(off.argmax())} are up to "
-                f"{1e3 * off.max():.0f} mm from their commands, more than the {1e3 * MARGIN:g} mm by which a designed "
+                f"{1e3 * off.max():.3g} mm from their commands, more than the {1e3 * MARGIN:g} mm by which a designed "
                 "motion keeps its bounds. The diagnosis uses the measured poses. If this was not intended, record the "
                 "motions again, or leave out their commands."
             )
