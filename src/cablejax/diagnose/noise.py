@@ -175,7 +175,7 @@ def _held(keypoints, hold, shortest: int):
         return None
     variance = squares / np.maximum(count, 1)
     if shortest < _SHORTEST_HOLD:
-        return squares / np.maximum(count, 1), count, np.zeros(_LAGS), len(usual) - len(kept)
+        return variance, count, np.zeros(_LAGS), len(usual) - len(kept)
     level = squares.sum() / count.sum()
     correlation = products[:, 0] / np.maximum(products[:, 1], 1) / level
     slow = _first_order(correlation, collections.Counter(min(one[0], _LONG) for one in kept), _scattered(count))
