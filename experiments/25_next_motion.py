@@ -212,13 +212,12 @@ def needed(row: dict[str, Any]) -> float:
 def table_of_needs(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
     """By arm: seeds that are answered after so many motions, and the median of motions needed by the rest."""
     first = {row["seed"] for row in rows if needed(row) == 0}
-    head = ["arm", "by the first log", *(f"by {n} motion{'s' * (n > 1)} more" for n in range(1, ADDED + 1))]
-    table = [[*head, "motions needed by those that the first log does not answer, median"]]
+    head = ["arm", "by the first log", *(f"with {n} more motion{'s' * (n > 1)}" for n in range(1, ADDED + 1))]
+    table = [[*head, "motions that the others need, median"]]
     for arm in dict.fromkeys(row["arm"] for row in rows):
         needs = {row["seed"]: needed(row) for row in rows if row["arm"] == arm}
         counts = [f"{sum(n <= added for n in needs.values())} of {len(needs)}" for added in range(ADDED + 1)]
-        later = [n for seed, n in needs.items() if seed not in first]
-        median = np.median(later) if later else np.nan
+        median = np.median([n for seed, n in needs.items() if seed not in first] or [0])
         table.append([arm, *counts, f"{median:g}" if median <= ADDED else f"more than {ADDED}"])
     return table
 
@@ -272,8 +271,8 @@ def page(rows: Sequence[dict[str, Any]], machines: str) -> str:
         "",
         *markdown_table(table),
         "",
-        "Answered is a seed once only the truth is left, of stiffness and density possibly both (without those below "
-        "1 %):",
+        "Seeds that are answered: only the truth is left, or stiffness and density if one of them is the truth. "
+        "Explanations below 1 % do not count.",
         "",
         *markdown_table(
             table_of_needs([row for arm in arms for row in rows if row["arm"] == arm and row["seed"] in common])

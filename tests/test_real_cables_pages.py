@@ -73,7 +73,7 @@ def test_recordings_are_checked_and_repaired_before_they_are_scored_and_no_sampl
     found, repairs = repaired_blocks(recordings)
     assert found.source_id.tolist() == [0, 1, 2] and np.isnan(found.keypoints[1, 100, 5]).all()
     np.testing.assert_allclose(found.keypoints[[0, 2]], right.keypoints[[0, 2]], atol=1e-12)
-    assert [words for words in ("Block 3", "in mm", "exchanged", "keypoint 5 is farther") if words in " ".join(repairs)]
+    assert all(words in " ".join(repairs) for words in ("Block 3", "in mm", "exchanged", "keypoint 5 is farther"))
     assert len(repairs) == 4
     np.testing.assert_allclose(protocol_windows(found).arclength, protocol_windows(right).arclength, atol=1e-3)
     sideways = dataclasses.replace(recordings, keypoints=points[..., [1, 2, 0]])

@@ -91,8 +91,11 @@ def diagnose(
         following, none_kept = _following(judge, None if bounds is None else DesignConfig())
     repaired, rounds = case.recording.as_log(case.log.meta), rounds_of(case.log, found)
     caveats = [*contradictions(rounds), *silent_motions(found.evidence, conclusion, calibration)]
-    caveats += rarely_left(conclusion)
-    caveats += [*caveats_of(case, calibration, length, stated, commissioned=bool(commissioning)), *none_kept]
+    caveats += [
+        *rarely_left(conclusion),
+        *caveats_of(case, calibration, length, stated, commissioned=bool(commissioning)),
+        *none_kept,
+    ]
     fields = Examined(found, conclusion, reference, after, gap).fields()
     if case.arms.strays(negligible(calibration, case.config.cable.length)) and alone.verdict in _ARMS_TOO:
         # what is left of the gap is theirs: not a share that right explanations leave, nor for an unknown cause to take

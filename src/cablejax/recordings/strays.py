@@ -73,20 +73,19 @@ def without_doubles(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str
         ValueError: two neighbours are at one place in most samples: it is one marker.
     """
     points = np.concatenate([take.keypoints for take in takes])
-    count = points.shape[1]
-    pairs = [(i, j) for i, j in itertools.combinations(range(count), 2) if _doubled(points, i, j).mean() > 0]
-    mostly = [pair for pair in pairs if _doubled(points, *pair).mean() > _ONE_MARKER]
-    if neighbours := [(i, j) for i, j in mostly if j == i + 1]:
+    pairs = itertools.combinations(range(points.shape[1]), 2)
+    share = {pair: float(_doubled(points, *pair).mean()) for pair in pairs}
+    if neighbours := [(i, j) for (i, j), part in share.items() if part > _ONE_MARKER and j == i + 1]:
         i, j = neighbours[0]
         raise ValueError(
-            f"Keypoints {i} and {j} are at one place in {100 * _doubled(points, i, j).mean():.0f} % of the samples, "
+            f"Keypoints {i} and {j} are at one place in {100 * share[i, j]:.0f} % of the samples, "
             "expected a marker of its own for each: leave one of the two out, or check which columns or topic are read."
         )
 
     def off(points: Float[np.ndarray, "T N D"]) -> np.ndarray:
         found = np.zeros(points.shape[:2], bool)
-        for pair in pairs:
-            if pair not in mostly:
+        for pair, part in share.items():
+            if 0 < part <= _ONE_MARKER:
                 found[:, pair] |= _doubled(points, *pair)[:, None]
         return found
 

@@ -271,7 +271,8 @@ def _short(length: Int[np.ndarray, "E"], samples: int, least: int) -> float:
 def _first_pair(points: Float[np.ndarray, "T F 3"]) -> int:
     """The first of two samples that have all keypoints; the number of samples where there are none."""
     seen = np.asarray(np.isfinite(points).all(axis=(1, 2)))
-    return int(np.append(seen[:-1] & seen[1:], True).argmax()) if seen.any() else len(points)
+    both = seen[:-1] & seen[1:]
+    return int(both.argmax()) if both.any() else len(points)
 
 
 def _sample_interval(log: GapLog) -> float:
