@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -35,10 +34,9 @@ from cablejax.diagnose.diagnosis import (
 from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.gap import shrinkage
 from cablejax.diagnose.judgement import beside_unknown, judged, verdict_sentence
-from cablejax.diagnose.laws import Law
 from cablejax.diagnose.posterior import drawn_by, draws, over_laws, posterior
 from cablejax.diagnose.protocol import Simulator
-from cablejax.diagnose.search import Search
+from cablejax.diagnose.search import Law, Search
 
 _GRIPPER = "gripper"
 """Several of an effect are one with lists of values, as of keypoints, but each gripper's is one for itself."""
@@ -75,15 +73,13 @@ class Conclusion:
     nothing: float = 0.0
 
 
-def conclude(found: Search, laws: Sequence[Law] = ()) -> Conclusion:
+def conclude(found: Search) -> Conclusion:
     """Probabilities, equivalence sets and the verdict.
 
-    Args:
-        found: by the search.
-        laws: what was found by the simulator's other laws: the verdict is not theirs, but its intervals hold over all,
-            and where the most probable one leaves no gap, no effect is named.
+    The verdict is that of the simulator's own law; probabilities of look-alikes and intervals are over all of them.
+    Where the most probable one leaves no gap, no effect is named.
     """
-    conclusion, drawn = _concluded(found, laws)
+    conclusion, drawn = _concluded(found)
     if not conclusion.effects:
         return conclusion
     every = posterior(found, drawn)
@@ -91,7 +87,7 @@ def conclude(found: Search, laws: Sequence[Law] = ()) -> Conclusion:
 
 
 def _concluded(
-    found: Search, laws: Sequence[Law] = (), drawn: Float[np.ndarray, "D P"] | None = None
+    found: Search, drawn: Float[np.ndarray, "D P"] | None = None
 ) -> tuple[Conclusion, Float[np.ndarray, "D P"]]:
     """The conclusion without its posterior, and draws of the best fit's coordinates over all laws.
 
@@ -103,8 +99,8 @@ def _concluded(
     none = Conclusion("none", found.null, (), (), _ranking(found), 0.0)
     if not has_gap(found.null, evidence, calibration):
         return none, nothing
-    shared = [drawn_by(law, best) for law in laws]
-    under = tuple(itertools.starmap(_under, zip(laws, shared, strict=True)))
+    shared = [drawn_by(law, best) for law in found.laws]
+    under = tuple(map(_under, found.laws, shared))
     if _excused(under):
         return dataclasses.replace(none, under_laws=under), nothing
     unknown = dataclasses.replace(
@@ -128,7 +124,7 @@ def _concluded(
         return unknown, nothing
 
     own = draws(evidence, best, calibration) if drawn is None else drawn
-    drawn = over_laws(own, [(law.probability, each[1]) for law, each in zip(laws, shared, strict=True) if each])
+    drawn = over_laws(own, [(law.probability, each[1]) for law, each in zip(found.laws, shared, strict=True) if each])
     chances = {name: _in_its_place(name, found) for name in effect_names(best.explanation)}
     equivalent = tuple(tuple(alike) for alike in chances.values() if len(alike) > 1)
     verdict = judged(resolvable=True, telling=True, complete=complete, alike=bool(equivalent))

@@ -67,10 +67,14 @@ class PlanarCable(Simulator):
     def other_laws(self) -> dict[str, Simulator]:
         """The same cable under each of `OTHER_LAWS`, and under other readings of the log."""
         believed, laws = self.playback.believed, dict[str, Simulator](self.readings)
-        for assumes, changed in OTHER_LAWS.items():
-            values = {name: np.asarray(value, believed.friction.dtype) for name, value in changed.items()}
-            playback = dataclasses.replace(self.playback, believed=dataclasses.replace(believed, **values))
-            laws[assumes] = dataclasses.replace(self, playback=playback)
+        for assumes, fields in OTHER_LAWS.items():
+            values = {name: np.asarray(value, believed.friction.dtype) for name, value in fields.items()}
+            changed = dataclasses.replace(believed, **values)
+            laws[assumes] = dataclasses.replace(
+                self,
+                playback=dataclasses.replace(self.playback, believed=changed),
+                effects=tuple(effect.besides(changed) for effect in self.effects),
+            )
         return laws
 
     def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T N 2"]:

@@ -17,8 +17,7 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import EffectValues
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate
-from cablejax.diagnose.laws import Law
-from cablejax.diagnose.search import Search
+from cablejax.diagnose.search import Law, Search
 
 QUANTILE = 1.6449
 """Of the normal distribution, at 95 %: the intervals are two-sided 90 %."""

@@ -206,8 +206,9 @@ def explain(
     if has_gap(null, evidence, calibration):
         found = search(evidence, null, calibration, progress=progress)
         progress("fitting by other laws")
-        return found, conclude(found, by_other_laws(found))
-    found = Search.of([null], evidence, calibration)
+        found = by_other_laws(found)
+    else:
+        found = Search.of([null], evidence, calibration)
     return found, conclude(found)
 
 

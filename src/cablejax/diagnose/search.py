@@ -28,6 +28,21 @@ _MOST_IN_DOUBT = 5
 
 
 @dataclasses.dataclass(frozen=True)
+class Law:
+    """The leading explanations, fitted by another law of the simulator.
+
+    Attributes:
+        assumes: in words.
+        found: fits by this law.
+        probability: of the law, among all.
+    """
+
+    assumes: str
+    found: Search
+    probability: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Search:
     """All explanations that were fitted to a recording.
 
@@ -35,8 +50,9 @@ class Search:
         evidence: that was explained.
         calibration: of the judgement.
         fits: of different sets of effects, best first; one is the nominal simulator.
-        scores: their log posterior, see `belief.log_scores`.
+        scores: their log posterior, see `belief.log_scores`; over all laws where others were tried, see `laws`.
         screened: {effect: share of the squared gap that its best template takes away}.
+        laws: what was found by the simulator's other laws.
     """
 
     evidence: Evidence
@@ -44,6 +60,7 @@ class Search:
     fits: tuple[Fit, ...]
     scores: Float[np.ndarray, "F"]
     screened: dict[str, float] = dataclasses.field(default_factory=dict)
+    laws: tuple[Law, ...] = ()
 
     @classmethod
     def of(
@@ -51,8 +68,12 @@ class Search:
     ) -> Search:
         """Scores fits, and sorts them."""
         scores = log_scores(fits, evidence, calibration)
+        return cls(evidence, calibration, tuple(fits), scores, screened or {}).ranked(scores)
+
+    def ranked(self, scores: Float[np.ndarray, "F"]) -> Search:
+        """The search with these scores, sorted by them."""
         best_first = np.argsort(-scores, kind="stable")
-        return cls(evidence, calibration, tuple(fits[i] for i in best_first), scores[best_first], screened or {})
+        return dataclasses.replace(self, fits=tuple(self.fits[i] for i in best_first), scores=scores[best_first])
 
     @property
     def null(self) -> Fit:

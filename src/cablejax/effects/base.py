@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Discretisation
-from cablejax.effects.effect import Effect, Parameter
+from cablejax.effects.effect import Effect
 from cablejax.effects.physics import Physics
 
 
@@ -69,6 +69,11 @@ class CableEffect(Effect, abc.ABC):
         del place
         return self
 
+    def besides(self, believed: Physics) -> CableEffect:
+        """The effect of a cable that is believed to have this physics: without forms that make the same once more."""
+        del believed
+        return self
+
     def sized(self, length: float) -> CableEffect:
         """The effect on a cable of this length [m]: lengths and curvatures are sought in proportion to it.
 
@@ -87,11 +92,11 @@ class CableEffect(Effect, abc.ABC):
             for p, factor in zip(self.parameters, factors, strict=True)
         )
         null = tuple(factor * value for value, factor in zip(self.null, factors, strict=True))
-        return self._with_parameters(parameters, null)
+        return self._with(parameters=parameters, null=null)
 
-    def _with_parameters(self, parameters: tuple[Parameter, ...], null: tuple[float, ...]) -> CableEffect:
+    def _with(self, **attributes: Any) -> CableEffect:
         other = copy.copy(self)
-        vars(other).update(parameters=parameters, null=null)
+        vars(other).update(attributes)
         return other
 
     def seen_from(self, parameters: Mapping[str, float], place: Sequence[float]) -> dict[str, float]:

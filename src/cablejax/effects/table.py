@@ -39,6 +39,10 @@ class TableFriction(CableEffect):
     variants = (0, 1)
     amplitude, reversible, alone = 0, True, True
 
+    def besides(self, believed):
+        """Where friction is believed to stick harder than it slides, the coefficient alone."""
+        return self._with(variants=(0,)) if believed.static_excess > 0 else self
+
     def apply(self, physics, values, variant, config):
         """Multiplies the coefficient by the ratio; in variant 1 also sets the excess of static friction."""
         nominal = physics.friction + (_believed(config) if config.cable.friction_coefficient == 0 else 0.0)
@@ -78,7 +82,7 @@ class _AtPlace(CableEffect):
             for p, shift in zip(self.parameters, shifts, strict=True)
         )
         null = tuple(value + shift for value, shift in zip(self.null, shifts, strict=True))
-        return self._with_parameters(parameters, null)
+        return self._with(parameters=parameters, null=null)
 
     def seen_from(self, parameters, place):
         """Its centre moves."""

@@ -68,11 +68,13 @@ def alike(diagnosis: CableDiagnosis) -> list[tuple[list[str], list[str]]]:
 
 def under_other_laws(diagnosis: Diagnosis) -> list[str]:
     """The verdict under each other law of the simulator, in words."""
-    return [
+    said = [
         f"If {law.assumes}, {_verdict_under(law)}. Of all laws that were tried, this one has a probability of "
-        f"{share(law.probability)} on this log. The intervals cover every law under which the same effects are found."
+        f"{share(law.probability)} on this log."
         for law in diagnosis.under_laws
     ]
+    over = "Probabilities of effects are over all laws, intervals over those under which the same effects are found."
+    return [*said, over] if diagnosis.effects and said else said
 
 
 def _verdict_under(law: UnderLaw) -> str:
