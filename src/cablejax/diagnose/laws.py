@@ -5,9 +5,9 @@ carries the whole cable. Where the simulator offers another law (`Simulator.othe
 the simulator without any effect are refitted under that law. All laws have equal prior probability; the posterior of a
 law is that of all its fits together.
 
-The verdict is that of the simulator's own law, under which a named effect is added. Only the probabilities of look-alikes
-are averages over all laws: an effect that makes up for what the own law gets wrong, as a static friction above the
-kinetic one does, would otherwise rank before the cause.
+The verdict is that of the simulator's own law, under which a named effect is added. Only the probabilities of
+look-alikes are averages over all laws: an effect that makes up for what the own law gets wrong, as a static friction
+above the kinetic one does, would otherwise rank before the cause.
 """
 
 from __future__ import annotations
