@@ -233,8 +233,8 @@ class Diagnosis:
             where nothing is named.
         quantities: quantities of the system that the log identifies, whether or not an effect is named; empty if the
             adapter has none.
-        under_laws: the verdict under other laws of the simulator; probabilities and intervals of `effects` and
-            `posterior` cover all laws. Empty without a gap, or if the simulator offers none.
+        under_laws: the verdict under other laws of the simulator; probabilities of look-alikes, intervals of `effects`
+            and `posterior` cover all laws. Empty without a gap, or if the simulator offers none.
     """
 
     verdict: Verdict

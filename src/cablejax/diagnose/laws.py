@@ -16,16 +16,13 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import softmax
+from scipy.special import log_softmax, logsumexp, softmax
 
 from cablejax.diagnose.belief import effect_names
 from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import Explanation, Simulator, explanation
 from cablejax.diagnose.refits import refitted
 from cablejax.diagnose.search import Law, Search
-
-# The simulator's own law has what the others leave, which may be as much below 0.
-_ROUNDING = 1e-12
 
 
 def by_other_laws(found: Search) -> Search:
@@ -45,11 +42,10 @@ def by_other_laws(found: Search) -> Search:
         *starts, null = evaluate(other, [*(_there(one, simulator) for one in leading), explanation()])
         fits = improve(other, starts, simulator.plan.last_steps)
         searches.append(Search.of(refitted(other, [*fits, null]), other, found.calibration))
-    tried = [set(one.terms) for one in leading] + [set()]
-    own = [score for fit, score in zip(found.fits, found.scores, strict=True) if set(fit.explanation.terms) in tried]
-    totals = np.array([np.logaddexp.reduce(own), *(np.logaddexp.reduce(search.scores) for search in searches)])
-    chances = np.exp(totals - np.logaddexp.reduce(totals))[1:].tolist()
-    return _over_laws(found, tuple(map(Law, others, searches, chances)))
+    names = [effect_names(one) for one in leading]
+    chances = softmax([np.logaddexp.reduce(_scores(search, [*names, ()])) for search in (found, *searches)])
+    laws = tuple(map(Law, others, searches, chances[1:].tolist()))
+    return _ranked(dataclasses.replace(found, laws=laws), names, chances)
 
 
 def _there(one: Explanation, simulator: Simulator) -> Explanation:
@@ -62,28 +58,23 @@ def _there(one: Explanation, simulator: Simulator) -> Explanation:
     return dataclasses.replace(one, terms=terms)
 
 
-def _over_laws(found: Search, laws: tuple[Law, ...]) -> Search:
-    """The search with those explanations ranked over all laws that are open and have as many effects as the best.
+def _ranked(found: Search, leading: list[tuple[str, ...]], chances: Float[np.ndarray, "L"]) -> Search:
+    """The search with those of its leading explanations ranked over all laws that have as many effects as the best.
 
     How they compare with all others stays for the simulator's own law to say: the most probable has the best's score.
+    `chances` are the laws' probabilities, the simulator's own first.
     """
-    size = len(effect_names(found.fits[0].explanation))
-    names = [effect_names(fit.explanation) for fit in found.in_doubt()[0]]
-    alike = [one for one in names if len(one) == size]
-    if not size or len(alike) < 2:
-        return dataclasses.replace(found, laws=laws)
-    each = [(1.0 - sum(law.probability for law in laws), found), *((law.probability, law.found) for law in laws)]
-    shares = np.array([_shares(search, alike) for _, search in each])
-    chances = np.maximum([chance for chance, _ in each], _ROUNDING)
-    over = np.log(np.maximum(chances / chances.sum() @ shares, np.finfo(float).tiny))
-    over += found.scores[0] - over.max()
-    better = dict(zip(alike, over.tolist(), strict=True))
-    kept = zip(found.fits, found.scores.tolist(), strict=True)
-    scores = [better.get(effect_names(fit.explanation), score) for fit, score in kept]
-    return dataclasses.replace(found, laws=laws).ranked(np.array(scores))
+    alike = [names for names in leading if len(names) == len(effect_names(found.fits[0].explanation))]
+    if len(alike) < 2:
+        return found
+    shares = log_softmax([_scores(search, alike) for search in (found, *(law.found for law in found.laws))], axis=1)
+    over = logsumexp(shares, axis=0, b=chances[:, None])
+    better = dict(zip(alike, found.scores[0] + over - over.max(), strict=True))
+    kept = zip(found.fits, found.scores, strict=True)
+    return found.ranked(np.array([better.get(effect_names(fit.explanation), score) for fit, score in kept]))
 
 
-def _shares(found: Search, alike: list[tuple[str, ...]]) -> Float[np.ndarray, "A"]:
-    """Probabilities of these sets of effects, given that one of them holds."""
+def _scores(found: Search, names: list[tuple[str, ...]]) -> list[float]:
+    """Scores of these sets of effects."""
     scores = {effect_names(fit.explanation): score for fit, score in zip(found.fits, found.scores, strict=True)}
-    return softmax([scores[one] for one in alike])
+    return [scores[one] for one in names]

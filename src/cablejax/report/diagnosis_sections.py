@@ -73,7 +73,7 @@ def under_other_laws(diagnosis: Diagnosis) -> list[str]:
         f"{share(law.probability)} on this log."
         for law in diagnosis.under_laws
     ]
-    over = "Probabilities of effects are over all laws, intervals over those under which the same effects are found."
+    over = "Probabilities of look-alikes are over all laws, intervals over those by which the same effects are found."
     return [*said, over] if diagnosis.effects and said else said
 
 
