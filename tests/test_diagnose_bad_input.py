@@ -115,6 +115,32 @@ def test_a_tracker_that_repeats_its_last_value_is_not_believed():
     assert result.verdict == "none" and caveat(result, "Keypoint 4 repeats its last value")
 
 
+def test_a_tracker_that_misreads_single_keypoints_makes_no_gap():
+    log, rng = record(), np.random.default_rng(0)
+    keypoints = log.keypoints.copy()
+    wrong = rng.random(keypoints.shape[:3]) < 0.01
+    keypoints[wrong] += 0.1 * rng.normal(size=(int(wrong.sum()), 2)).astype(np.float32)
+    result = told(dataclasses.replace(log, keypoints=keypoints))
+    assert result.verdict == "none" and caveat(result, "leaves its path while those around it")
+    assert result.noise_mm.max() < 1.2 * told(log).noise_mm.max()
+
+
+def test_keypoints_that_exchanged_their_names_make_no_gap():
+    log = record()
+    keypoints = log.keypoints.copy()
+    keypoints[:, 30:42, 5:7] = keypoints[:, 30:42, 6:4:-1]
+    result = told(dataclasses.replace(log, keypoints=keypoints))
+    assert result.verdict == "none" and caveat(result, "is farther from its neighbours than the cable allows in ")
+
+
+def test_an_episode_whose_keypoints_run_the_other_way_is_named():
+    log = record()
+    keypoints = log.keypoints.copy()
+    keypoints[2] = keypoints[2, :, ::-1]
+    with pytest.raises(DiagnosisError, match=r"In episode 2, unlike in others, keypoint 0 is at gripper 1 .* reverse"):
+        told(dataclasses.replace(log, keypoints=keypoints))
+
+
 def test_an_offset_of_the_tool_is_told():
     log = record()
     angle = log.gripper_pose[:, :, 0, 2]

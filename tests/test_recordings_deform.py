@@ -186,7 +186,14 @@ def test_real_recordings_are_read(name, markers, length):
     assert log.meta["cable"]["length_m"] == pytest.approx(length, abs=0.01)
     assert np.isfinite(log.gripper_pose).all()
     # The recordings themselves have the faults that the importer looks for, and few of them.
-    assert len(repairs) < 25
+    misread = [line.split(" leaves its path")[0] for line in repairs if "leaves its path" in line]
+    found = {
+        "DLO1": ["Take 58: keypoint 6", "Take 66: keypoint 7"],
+        "DLO2": ["Take 105: keypoint 1"],
+        "DLO3": ["Take 21: keypoint 4", "Take 26: keypoint 4"],
+    }
+    assert misread == found[name]
+    assert len(repairs) - len(misread) < 25
     exchanged = [line for line in repairs if "exchanged" in line]
     if name == "DLO1":
         assert [line.split(", and")[0] for line in exchanged] == [

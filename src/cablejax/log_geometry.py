@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cablejax.arrays import stretches
 from cablejax.cable_length import BENT, ring_chords
 from cablejax.poses import rotated
 from cablejax.types import GapLog
@@ -26,31 +25,12 @@ ASKEW = np.radians(60.0)
 _FEWEST = 5
 _NEAR = 1 / 8
 """Distance between an end's two keypoints, in lengths of the cable, up to which they show its direction there."""
-# So many samples without any change, while both neighbours move in most of them, are a tracker's last value.
-_FROZEN, _MOVING = 10, 0.8
 _DEGREES_OFF = 0.5
 _DEGREES_BETTER = 3.0
 _DEGREES_TURN = 10.0
 # A cable that turns so far [rad], so much with its gripper, shows its angle's unit.
 _TURNED, _WITH_IT = 0.35, 0.95
 _RADIANS = 'expected radians. Multiply it by pi / 180 (in a layout: `angle_unit = "deg"`).'
-
-
-def frozen(points: Float[np.ndarray, "T N D"]) -> Bool[np.ndarray, "T N"]:
-    """Which keypoints a tracker repeats to the last digit while both their neighbours move on.
-
-    Args:
-        points: [m], NaN = not observed.
-    """
-    found = np.zeros(points.shape[:2], bool)
-    same = np.asarray((points[1:] == points[:-1]).all(axis=-1))
-    for index in 1 + np.flatnonzero(same[:, 1:-1].sum(axis=0) >= _FROZEN):
-        for first, after in stretches(same[:, index]):
-            beside = points[first : after + 1][:, [index - 1, index + 1]]
-            moving = (np.abs(np.diff(beside, axis=0)) > 0).any(axis=-1)
-            if after - first >= _FROZEN and moving.mean(axis=0).min() > _MOVING:
-                found[first + 1 : after + 1, index] = True
-    return found
 
 
 def out_of_reach(
@@ -143,7 +123,8 @@ def cable_fault(log: GapLog) -> str | None:
         )
     points, pose = log.keypoints[log.valid].astype(float), log.gripper_pose[log.valid].astype(float)
     grippers = pose[..., :dimension]
-    near = AT_GRIPPER * float(log.meta["cable"]["length_m"])
+    length = float(log.meta["cable"]["length_m"])
+    near = AT_GRIPPER * length
     for gripper, (end, name) in enumerate(((0, "0"), (-1, "N - 1"))):
         seen = np.isfinite(points[:, end]).all(axis=-1)
         if not seen.any():
@@ -157,6 +138,15 @@ def cable_fault(log: GapLog) -> str | None:
                 else "are the keypoints and the poses in one frame, in metres, and of the same cable?"
             )
             return f"Keypoint {name} is {away:.2f} m from gripper {gripper}, expected it at the gripper: {advice}"
+    for episode, n in enumerate(log.episode_length):
+        seen = np.isfinite(log.keypoints[episode, :n, [0, -1]]).all(axis=(0, 2))
+        ends, places = log.keypoints[episode, :n][seen], log.gripper_pose[episode, :n, :, :dimension][seen]
+        crossed = [ends_exchanged(*one, length) for one in zip(ends.astype(float), places.astype(float), strict=True)]
+        if crossed and np.mean(crossed) > 0.5:
+            return (
+                f"In episode {episode}, unlike in others, keypoint 0 is at gripper 1 and keypoint N - 1 at gripper 0: "
+                "reverse the order of its keypoints, or exchange its grippers."
+            )
     # chords are shorter than the cable between them, the more so the fewer there are
     stated = np.diff(log.meta["keypoint_arclength_m"])
     chord = np.linalg.norm(np.diff(points, axis=1), axis=-1) / stated

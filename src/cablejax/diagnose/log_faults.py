@@ -1,14 +1,18 @@
-"""Faults of a recording that look like effects: frozen keypoints, offsets of a tool, commands of another meaning."""
+"""Faults of a recording that look like effects: false readings, offsets of a tool, commands of another meaning."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from cablejax.arrays import quarter_turn
-from cablejax.log_geometry import frozen
-from cablejax.types import ROTATION_WEIGHT
+from cablejax.false_keypoints import FAULTS
+from cablejax.limits import counted
+from cablejax.poses import without_misreadings
+from cablejax.types import ROTATION_WEIGHT, GapLog
 
 # An end keypoint that is off its gripper by this [m], at the same place of the gripper's frame, is reported.
 _TOOL, _FIXED = 2e-3, 0.5
@@ -23,24 +27,39 @@ _UNFIT, _FITS = 0.02, 0.2
 _LATEST = 1.0
 
 
-def without_frozen(points: Float[np.ndarray, "E T N 2"]) -> list[str]:
-    """Removes, in place, keypoints that a tracker repeats to the last digit while both their neighbours move on.
+def as_measured(log: GapLog) -> tuple[GapLog, list[str]]:
+    """A log without what was not measured, and sentences on it.
 
-    Args:
-        points: keypoints [m], NaN = not observed.
-
-    Returns:
-        A sentence on it, or nothing.
+    Poses of the grippers that jump away and back are interpolated; keypoints that a tracker holds or misreads count as
+    not observed, see `false_keypoints`.
     """
-    held = np.stack([frozen(episode) for episode in points])
-    points[held] = np.nan
-    found = np.flatnonzero(held.any(axis=(0, 1)))
-    if not len(found):
-        return []
-    return [
-        f"Keypoint {', '.join(map(str, found))} repeats its last value to the last digit while its neighbours move: "
-        "treated as not observed there."
-    ]
+    pose, points, sentences = log.gripper_pose.copy(), log.keypoints.copy(), []
+    for e, n in enumerate(log.episode_length):
+        pose[e, :n], jumps = without_misreadings(log.time[e, :n], pose[e, :n])
+        sentences += [f"In episode {e} the pose of gripper {q} {words}" for q, words in jumps.items()]
+    usual = _usual_spacing(log)
+    for words, find in FAULTS.items():
+        found = np.zeros(points.shape[:3], bool)
+        for e, n in enumerate(log.episode_length):
+            found[e, :n] = find(log.time[e, :n], points[e, :n], usual)
+        if found.any():
+            points[found] = np.nan
+            which, (episode, sample, _) = np.flatnonzero(found.any(axis=(0, 1))), np.argwhere(found)[0]
+            each = "Keypoint" if len(which) == 1 else "Each of keypoints"
+            sentences.append(
+                f"{each} {', '.join(map(str, which))} {words} in {counted(int(found.sum()), 'sample')}, the "
+                f"first at {log.time[episode, sample]:.4g} s of episode {episode}: treated as not observed."
+            )
+    return dataclasses.replace(log, gripper_pose=pose, keypoints=points) if sentences else log, sentences
+
+
+def _usual_spacing(log: GapLog) -> Float[np.ndarray, " M"]:
+    """How far each keypoint usually is from the next one [m], at least as stated: in a bent cable they are nearer."""
+    spacing = np.diff(np.asarray(log.meta["keypoint_arclength_m"], float))
+    distance = np.linalg.norm(np.diff(log.keypoints[log.valid].astype(float), axis=1), axis=-1)
+    for k in np.flatnonzero(np.isfinite(distance).any(axis=0)):
+        spacing[k] = max(spacing[k], float(np.nanmedian(distance[:, k])))
+    return spacing
 
 
 def tool_offset(end: Float[np.ndarray, "E T 2"], pose: Float[np.ndarray, "E T 3"], gripper: int) -> list[str]:

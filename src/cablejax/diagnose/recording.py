@@ -9,12 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cablejax.diagnose.clock import furthest_off, is_even, on_even_clock, usual_interval
-from cablejax.diagnose.log_faults import clock_offset, command_fault, early_keypoints, tool_offset, without_frozen
+from cablejax.diagnose.log_faults import as_measured, clock_offset, command_fault, early_keypoints, tool_offset
 from cablejax.diagnose.noise import still
 from cablejax.gaplog import Episode, episodes_of, validate
 from cablejax.gaplog_join import commands_derived
 from cablejax.log_geometry import cable_fault
-from cablejax.poses import without_misreadings
 from cablejax.types import GapLog
 
 # Samples are padded to a multiple of this, so that logs of nearly equal length share one compiled program.
@@ -100,7 +99,7 @@ def prepare(log: GapLog) -> Recording:
             "expected a cable on a table (2) between two grippers."
         )
     n_episodes = len(log.episode_length)
-    caveats: list[str] = []
+    log, caveats = as_measured(log)
     if n_episodes == 1:
         caveats.append(
             "The log has one episode, so none can be held out: no shrinkage is reported, and every probability is less "
@@ -117,8 +116,7 @@ def prepare(log: GapLog) -> Recording:
     episodes, intervals = [], []
     derived = commands_derived(log)
     for e, recorded in enumerate(episodes_of(log)):
-        episode, misread = _continuous(recorded, observed=e not in short, commanded=not derived[e])
-        caveats += [f"In episode {e} the pose of gripper {q} {words}" for q, words in misread.items()]
+        episode = _continuous(recorded, observed=e not in short, commanded=not derived[e])
         interval = usual_interval(episode.time)
         if not is_even(episode.time, interval):
             caveats.append(
@@ -145,7 +143,6 @@ def prepare(log: GapLog) -> Recording:
             f"{wrong} of {int(marked.sum())} samples are marked as holds although the grippers move. They are not used "
             "as holds."
         )
-    caveats += without_frozen(points)
     recording = Recording(
         keypoints=points,
         gripper_pose=pose,
@@ -181,19 +178,17 @@ def _without_commands(recording: Recording) -> list[str]:
     ]
 
 
-def _continuous(episode: Episode, *, observed: bool, commanded: bool) -> tuple[Episode, dict[int, str]]:
-    """An episode in double precision, its angles continuous in time and along the cable, and what was taken out."""
-    points = episode.keypoints.astype(float)
-    pose, misread = without_misreadings(episode.time, episode.gripper_pose.astype(float))
+def _continuous(episode: Episode, *, observed: bool, commanded: bool) -> Episode:
+    """An episode in double precision, its angles continuous in time and along the cable."""
+    points, pose = episode.keypoints.astype(float), episode.gripper_pose.astype(float)
     pose[..., 2] = np.unwrap(pose[..., 2], axis=0)
     pose[:, 1, 2] += _whole_turns(points, pose)
-    repaired = dataclasses.replace(
+    return dataclasses.replace(
         episode,
         keypoints=points if observed else np.full_like(points, np.nan),
         gripper_pose=pose,
         gripper_command=np.nan_to_num(episode.gripper_command.astype(float)) if commanded else np.zeros_like(pose),
     )
-    return repaired, misread
 
 
 def _whole_turns(points: Float[np.ndarray, "T N 2"], pose: Float[np.ndarray, "T 2 3"]) -> float:

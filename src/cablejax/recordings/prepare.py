@@ -21,7 +21,7 @@ from cablejax.recordings.frames import (
 )
 from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
-from cablejax.recordings.strays import without_doubles, without_held, without_jumps, without_outliers, without_stretched
+from cablejax.recordings.strays import without_doubles, without_false_keypoints, without_outliers, without_stretched
 from cablejax.recordings.take import Take, spacing, typical_spacing
 from cablejax.recordings.units import METRES, recognised_unit, require_metres
 
@@ -98,8 +98,7 @@ def repaired(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], l
     """Checks and repairs takes of one cable without leaving out any sample.
 
     In this order: the unit of length; markers at one place; the frame; heights above a table, which are left out;
-    branches and the order of the markers; whether it is one cable; single markers that are held or jump; which way is
-    up.
+    branches and the order of the markers; whether it is one cable; markers that are held or misread; which way is up.
 
     Returns:
         As many takes, of as many samples, in metres, z up, right-handed; and a sentence on each repair.
@@ -134,8 +133,7 @@ def repaired(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], l
         takes = _noted(onto_table(takes), repairs)
     takes = _noted(restore_order(takes), repairs)
     _require_one_cable(takes, setup)
-    for step in (without_held, without_jumps):
-        takes = _noted(step(takes), repairs)
+    takes = _noted(without_false_keypoints(takes), repairs)
     if takes[0].keypoints.shape[2] == 3:
         require_hanging(takes, setup.frame)
     return takes, repairs

@@ -9,7 +9,7 @@ import numpy as np
 from cablejax.diagnose.clock import even_times, keypoints_at
 from cablejax.diagnose.log_faults import clock_offset
 from cablejax.gaplog import episodes_of, stack_episodes
-from cablejax.poses import poses_at, with_one_sign, without_misreadings
+from cablejax.poses import poses_at, with_one_sign
 from cablejax.types import GapLog
 
 # Clocks whose intervals are all within this share of the usual one are taken as they are,
@@ -63,26 +63,19 @@ def thinned(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
 def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     """Resamples a log whose clocks are uneven or differ between episodes, and returns sentences on the changes.
 
-    Readings of the grippers that jump away and back are taken out before, and many samples a second are `thinned`.
+    Many samples a second are `thinned`.
 
     Positions and tangents of the grippers are linear between samples, as under the twists that were held; keypoints are
     those of `diagnose.clock.keypoints_at`.
     """
-    pose, repairs = log.gripper_pose.copy(), []
-    for e, n in enumerate(log.episode_length):
-        pose[e, :n], jumps = without_misreadings(log.time[e, :n], pose[e, :n])
-        repairs += [f"In episode {e} the pose of gripper {q} {words}" for q, words in jumps.items()]
-    if repairs:
-        log = dataclasses.replace(log, gripper_pose=pose)
     steps = log.intervals
     if not len(steps):
-        return log, tuple(repairs)
+        return log, ()
     interval = float(np.median(steps))
     rates = [(time[n - 1] - time[0]) / (n - 1) for time, n in zip(log.time, log.episode_length, strict=True) if n > 1]
     same = np.abs(np.array(rates) - interval).max() <= _SAME_RATE * interval
     if same and np.abs(steps - interval).max() <= _EVEN * interval:
-        log, fewer = thinned(log)
-        return log, (*repairs, *fewer)
+        return thinned(log)
     episodes = []
     for one in episodes_of(log):
         time = one.time - one.time[0]
@@ -105,7 +98,7 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         f"{1e3 * interval:.3g} ms."
     )
     log, fewer = thinned(stack_episodes(episodes, log.meta, holds=log.hold is not None))
-    return log, (*repairs, report, *fewer)
+    return log, (report, *fewer)
 
 
 def with_poses_in_time(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:

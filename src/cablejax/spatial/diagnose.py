@@ -14,6 +14,7 @@ from jaxtyping import Float
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, listed, verdict_sentence
+from cablejax.diagnose.log_faults import as_measured
 from cablejax.diagnose.protocol import explanation
 from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.provenance import package_versions
@@ -76,7 +77,8 @@ def diagnose_space(
         ValueError: a log that cannot be diagnosed, with the reason.
     """
     begun = time.perf_counter()
-    log, repairs = on_one_clock(log)
+    log, repairs = as_measured(log)
+    log, resampled = on_one_clock(log)
     log, shifted = with_poses_in_time(log)
     log = with_roll(log)
     windows, left_out = _to_fit(log)
@@ -118,6 +120,7 @@ def diagnose_space(
         where=where,
         caveats=(
             *repairs,
+            *resampled,
             *shifted,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
             *_caveats(windows, left_out, found, own, hides=verdict == "none"),
