@@ -54,6 +54,18 @@ def test_exchanged_markers_are_put_back(rows, order):
         np.testing.assert_array_equal(after.keypoints, before.keypoints)
 
 
+def test_a_cable_that_slowly_folds_back_at_its_gripper_keeps_its_order():
+    points = swinging()
+    along = points[:, 2] - points[:, 1]
+    along *= 0.03 / np.linalg.norm(along, axis=1, keepdims=True)
+    turn = np.pi * np.sin(np.pi * np.arange(200) / 200)[:, None]
+    across = np.cross(along, [0.0, 1.0, 0.0])
+    points[:, 0] = points[:, 1] - np.cos(turn) * along - np.sin(turn) * across
+    (one, *_), repairs = restore_order((take(points), *others()))
+    np.testing.assert_array_equal(one.keypoints, points)
+    assert not repairs
+
+
 def test_exchanged_markers_are_reported_by_number_and_sample():
     points = exchanged(swinging(), slice(60, 130), [0, 1, 2, 4, 3, 5, 6, 7, 8])
     _, repairs = restore_order((take(points), *others()))

@@ -1,7 +1,8 @@
 """Restores the order of markers that motion capture exchanged in part of a recording.
 
-A cable does not fold back within one spacing of its markers, and no marker crosses the distance to another one within
-one sample. Where the order breaks this, and another order does not, the other one is right. Positions alone cannot show
+A cable seldom folds back within one spacing of its markers, and no marker crosses the distance to another one within
+one sample. Where the order breaks this, and another order does not, the other one is right, unless the cable got there
+without a jump. Positions alone cannot show
 a reversal of the whole order throughout a take whose spacings read alike from both ends.
 """
 
@@ -155,9 +156,13 @@ def _detours(points: Float[np.ndarray, "T N D"]) -> float:
 
 
 def _broken(points: Float[np.ndarray, "*B N D"], usual: Float[np.ndarray, " M"]) -> np.ndarray:
+    return (_worst_turn(points) < FOLDED) | _stretched(points, usual)
+
+
+def _stretched(points: Float[np.ndarray, "*B N D"], usual: Float[np.ndarray, " M"]) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = spacing(points) / usual
-    return (_worst_turn(points) < FOLDED) | (np.where(np.isfinite(ratio), ratio, 1.0).max(axis=-1) > STRETCHED)
+    return np.where(np.isfinite(ratio), ratio, 1.0).max(axis=-1) > STRETCHED
 
 
 def _reversed(take: Take, usual: Float[np.ndarray, " M"]) -> bool:
@@ -214,7 +219,8 @@ def _best(here, before, current, swaps, usual) -> np.ndarray:
     broken_now = bool(_broken(here[current], usual))
     now = np.inf if before is None else float(step(here[current]))
     first = not np.isfinite(now)
-    if not broken_now and (first or now < 0.5 * np.median(usual)):
+    jumps = now >= 0.5 * np.median(usual)
+    if not broken_now and (first or not jumps):
         return current
     candidates = [np.arange(len(current))[None], current[swaps]]
     if before is not None and seen.all() and np.isfinite(before).all():
@@ -229,6 +235,8 @@ def _best(here, before, current, swaps, usual) -> np.ndarray:
         return orders[np.argmin(np.nansum(spacing(here[orders]), axis=-1))]
     moved = step(here[orders])
     best = int(np.argmin(moved))
-    # a cable that is torn is broken too, and no order mends it: markers would have to cross it
-    mends = moved[best] < max(now, STRETCHED * usual.max()) if broken_now else moved[best] < CLEARLY * now
+    # a soft cable may fold back, or leave its gripper steeply, and one that is torn is broken too: no order mends
+    # these, for markers would have to cross it
+    wrong = broken_now and (jumps or bool(_stretched(here[current], usual)))
+    mends = moved[best] < (max(now, STRETCHED * usual.max()) if wrong else CLEARLY * now)
     return orders[best] if mends else current
