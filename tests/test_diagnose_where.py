@@ -102,6 +102,9 @@ def test_frames_tell_a_camera_from_marks_on_the_cable():
     mark = 6e-3 * tangent * (np.arange(POINTS) == 7)[:, None]
     marks = localise(*case(mark), np.full(POINTS, NOISE))
     assert marks.frames["body"] > 0.95 > 0.5 > marks.frames["image"]
+    assert marks.along_share > 0.95 and any("% of it lies along the cable" in text for text in marks.sentences)
+    across = localise(*case(mark[..., ::-1] * [-1, 1]), np.full(POINTS, NOISE))
+    assert across.along_share < 0.05 and not any("along the cable, but" in text for text in across.sentences)
 
 
 def test_neither_the_order_of_keypoints_nor_the_frame_matters():

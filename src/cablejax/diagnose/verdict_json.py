@@ -47,7 +47,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     motion that was tried separates the explanations; of several recordings `rounds`, the fields of `Round`, and
     `rounds_contradict`. `next_motion` is recommended only where that is false. `gap` has also `unit`, `before_rmse`,
     `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`, an effect also `alike`, `ranking`
-    also `leftover_mm` and `outcome`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
+    also `leftover_mm` and `outcome`, and `where` also `sentences`, `per_horizon_mm`, `frames` and `along_share`.
     """
     gap, rounds = diagnosis.gap, getattr(diagnosis, "rounds", None)
     return _plain(
@@ -274,10 +274,9 @@ def _where(where: Where) -> dict[str, Any]:
         "along_cable_mm": where.along_cable_mm,
         "per_episode_mm": where.per_episode_mm,
         "regimes": where.regimes,
-        "per_horizon_mm": [
-            {"horizon_s": seconds, "gap_mm": size} for seconds, size in sorted(where.horizons_mm.items())
-        ],
+        "per_horizon_mm": [{"horizon_s": end, "gap_mm": size} for end, size in sorted(where.horizons_mm.items())],
         "frames": where.frames,
+        "along_share": where.along_share,
         "sentences": where.sentences,
     }
 

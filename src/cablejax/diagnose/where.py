@@ -62,6 +62,8 @@ class Where:
         frames: share of the squared gap that an error constant in one frame would explain: "body" (each keypoint
             displaced along and across the cable), "table" (each displaced in x and y), "image" (one similarity of the
             whole picture).
+        along_share: share of the squared gap that lies along the cable, and not across it; None where it was not
+            computed, or nothing is above the noise.
         contrasts: by name: (ratio of the two sizes, p-value corrected for the number of contrasts).
         regime_masks: which samples each regime holds, for drawing, shape [E, T] each.
         sentences: what stands out, in words.
@@ -78,6 +80,7 @@ class Where:
     horizons_mm: dict[float, float]
     regimes: dict[str, float]
     frames: dict[str, float] = dataclasses.field(default_factory=dict)
+    along_share: float | None = None
     contrasts: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     regime_masks: dict[str, Bool[np.ndarray, "E T"]] = dataclasses.field(default_factory=dict)
     sentences: tuple[str, ...] = ()
@@ -129,6 +132,7 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         horizons_mm=_horizons(log, valid, size),
         regimes={name: size(mask[..., None]) for name, mask in regimes.masks.items()},
         frames=_frames(residual, noise, nominal),
+        along_share=_along_share(residual, noise, nominal),
         contrasts=_contrasts(squares, noise, size, regimes, motion, arclength),
         regime_masks=regimes.masks,
     )
@@ -208,6 +212,18 @@ def _horizons(log: GapLog, valid, size) -> dict[float, float]:
     return result
 
 
+def _tangents(nominal) -> np.ndarray:
+    along = np.gradient(nominal, axis=2)
+    return along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
+
+
+def _along_share(residual, noise, nominal) -> float | None:
+    tangent = _tangents(nominal)
+    parts = (residual * tangent).sum(axis=-1), (residual * quarter_turn(tangent)).sum(axis=-1)
+    along, across = (max(float(np.nanmean(part**2 - noise**2)), 0.0) for part in parts)
+    return along / (along + across) if along + across > 0 else None
+
+
 def _frames(residual, noise, nominal) -> dict[str, float]:
     """Share of the squared gap that a constant error in each frame explains, noise taken out of both."""
     seen = np.isfinite(residual).all(axis=-1)
@@ -215,8 +231,7 @@ def _frames(residual, noise, nominal) -> dict[str, float]:
     power = (np.where(seen[..., None], residual**2, 0.0)).sum() - 2 * floor[seen].sum()
     if power <= 2 * floor[seen].sum() * (NOISE_TOLERANCE - 1):
         return {}
-    tangent = np.gradient(nominal, axis=2)
-    tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-12)
+    tangent = _tangents(nominal)
     normal = quarter_turn(tangent)
     count = np.maximum(seen.sum(axis=(0, 1)), 1)
 

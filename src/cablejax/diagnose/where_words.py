@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 # How many times larger a gap has to be for a sentence about it.
 _CLEAR_RATIO = 1.5
-# Share of the squared gap that one frame has to explain.
+# Share of the squared gap that one frame has to explain, or that has to lie along the cable.
 _FRAME_SHARE = 0.7
 
 
@@ -46,7 +46,8 @@ def describe(
             f"No episode deviates from the simulator by more than the noise of {_mm(floor)}.",
             f"A gap of {_mm(max(where.smallest_mm, 0.01))} or more over the whole log would have shown.",
         )
-    sentences = [_size(where, shown, floor, names), *_along(where, arclength), *_when(where), *_frame(where)]
+    sentences = [_size(where, shown, floor, names), *_direction(where), *_along(where, arclength), *_when(where)]
+    sentences += _frame(where)
     motions = total if motions is None else motions
     if motions >= 6:
         return tuple(sentences[:5])
@@ -146,6 +147,16 @@ def _when(where: Where) -> list[str]:
             sentences.append(f"It is {max(ratio, 1 / ratio):.1f} times larger {more}.")
             break
     return sentences
+
+
+def _direction(where: Where) -> list[str]:
+    share = where.along_share or 0.0
+    if share <= _FRAME_SHARE:
+        return []
+    return [
+        f"{100 * share:.0f} % of it lies along the cable, but what bends a cable moves it mostly "
+        "across: look for keypoints that the tracker lets slide along it, wrong arc lengths, a stretch or a slip."
+    ]
 
 
 def _frame(where: Where) -> list[str]:
