@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.recordings.deform import DeformRecordings
+from cablejax.recordings.gaps import bridged
 from cablejax.recordings.take import median_step
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.spatial.windows import Windows
@@ -52,7 +53,7 @@ def cables_in(path: pathlib.Path) -> dict[str, pathlib.Path]:
 def protocol_windows(recordings: DeformRecordings) -> Windows:
     """Every block as one window. Samples after a jump in time, or after the grippers were not seen for 0.1 s, are not
     fitted nor scored by `Windows.valid`, but simulated through. A block that does not begin with two samples of all
-    markers is left out.
+    markers, or of which a short gap does not show them, is left out.
 
     Args:
         recordings: checked and repaired, see `repaired_blocks`.
@@ -66,6 +67,9 @@ def protocol_windows(recordings: DeformRecordings) -> Windows:
     padded = np.pad(step, ((0, 0), (1, 1)))
     jump = step > 2 * np.maximum(padded[:, :-2], padded[:, 2:]) + _JUMP
     count = np.where(jump.any(axis=1), np.minimum(jump.argmax(axis=1) + 1, count), count)
+    points = points.copy()
+    begins = np.stack([bridged(block, recordings.dt)[:2] for block in points])
+    points[:, :2] = np.where(np.isfinite(points[:, :2]), points[:, :2], begins)
     whole = np.isfinite(points[:, :2]).all(axis=(1, 2, 3))
     if not whole.any():
         raise ValueError(f"{recordings.name}: no block begins with two samples of all markers.")
