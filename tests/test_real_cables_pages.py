@@ -49,6 +49,7 @@ def test_windows_of_recordings_with_gaps():
     points[0, 150:] = np.nan  # a shorter block
     points[1, 50:55, 0] = np.nan  # a gripper for a moment
     points[1, 120:150, 8] = np.nan  # and for long
+    points[1, 1, 6] = np.nan  # between two samples that show it
     points[2, 0, 4] = np.nan  # not all at the beginning
     points[3, 80:90, 3:6] = np.nan
     windows = protocol_windows(recordings)
@@ -57,6 +58,7 @@ def test_windows_of_recordings_with_gaps():
     assert np.isfinite(windows.position).all() and np.isfinite(windows.frames).all()
     np.testing.assert_allclose(windows.arclength, whole.arclength, atol=1e-3)
     np.testing.assert_allclose(windows.position[1, 50:55], whole.position[1, 50:55], atol=3e-3)
+    np.testing.assert_allclose(windows.keypoints[1, 1, 4], whole.keypoints[1, 1, 4], atol=2e-3)
     assert np.isnan(windows.observed[2, 80:90, 1:4]).all()
     points[:, :, 3] = np.nan
     with pytest.raises(ValueError, match="no block begins"):
