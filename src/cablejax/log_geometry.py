@@ -46,7 +46,9 @@ def out_of_reach(
     return _distance(keypoints, grippers) > REACH * length + 1.0
 
 
-def ends_exchanged(keypoints: Float[np.ndarray, "N D"], grippers: Float[np.ndarray, "Q D"], length: float) -> bool:
+def ends_exchanged(
+    keypoints: Float[np.ndarray, "*T N D"], grippers: Float[np.ndarray, "*T Q D"], length: float
+) -> Bool[np.ndarray, "*T"]:
     """Whether each end of the cable is seen at the other end's gripper: the tracker, or the arms, changed their order.
 
     Args:
@@ -54,9 +56,9 @@ def ends_exchanged(keypoints: Float[np.ndarray, "N D"], grippers: Float[np.ndarr
         grippers: positions [m], NaN = not known.
         length: of the cable [m].
     """
-    ends = keypoints[[0, -1]]
-    own, other = (float(np.linalg.norm(ends - at, axis=-1).max()) for at in (grippers, grippers[::-1]))
-    return own > AT_GRIPPER * length and other < AT_GRIPPER * length
+    ends = np.asarray(keypoints)[..., [0, -1], :]
+    own, other = (np.linalg.norm(ends - at, axis=-1).max(axis=-1) for at in (grippers, grippers[..., ::-1, :]))
+    return (own > AT_GRIPPER * length) & (other < AT_GRIPPER * length)
 
 
 def _distance(
@@ -140,9 +142,8 @@ def cable_fault(log: GapLog) -> str | None:
             return f"Keypoint {name} is {away:.2f} m from gripper {gripper}, expected it at the gripper: {advice}"
     for episode, n in enumerate(log.episode_length):
         seen = np.isfinite(log.keypoints[episode, :n, [0, -1]]).all(axis=(0, 2))
-        ends, places = log.keypoints[episode, :n][seen], log.gripper_pose[episode, :n, :, :dimension][seen]
-        crossed = [ends_exchanged(*one, length) for one in zip(ends.astype(float), places.astype(float), strict=True)]
-        if crossed and np.mean(crossed) > 0.5:
+        places = log.gripper_pose[episode, :n, :, :dimension]
+        if seen.any() and ends_exchanged(log.keypoints[episode, :n], places, length)[seen].mean() > 0.5:
             return (
                 f"In episode {episode}, unlike in others, keypoint 0 is at gripper 1 and keypoint N - 1 at gripper 0: "
                 "reverse the order of its keypoints, or exchange its grippers."
