@@ -68,8 +68,7 @@ def protocol_windows(recordings: DeformRecordings) -> Windows:
     jump = step > 2 * np.maximum(padded[:, :-2], padded[:, 2:]) + _JUMP
     count = np.where(jump.any(axis=1), np.minimum(jump.argmax(axis=1) + 1, count), count)
     points = points.copy()
-    begins = np.stack([bridged(block, recordings.dt)[:2] for block in points])
-    points[:, :2] = np.where(np.isfinite(points[:, :2]), points[:, :2], begins)
+    points[:, :2] = [bridged(block, recordings.dt)[:2] for block in points]
     whole = np.isfinite(points[:, :2]).all(axis=(1, 2, 3))
     if not whole.any():
         raise ValueError(f"{recordings.name}: no block begins with two samples of all markers.")

@@ -92,26 +92,22 @@ def _fewest(
     Not those from which the path goes on, on either side: a gripper that jerks stays where it is then.
     """
 
-    def shares(rest: Int[np.ndarray, " R"]) -> Float[np.ndarray, " S"]:
-        return np.nan_to_num(_off_path(time[rest], path[rest]) / allowed[rest])
-
-    def excess(share: Float[np.ndarray, " S"]) -> float:
-        return float(np.maximum(share - 1.0, 0.0).sum())
+    def excess(rest: Int[np.ndarray, " R"]) -> tuple[float, float]:
+        """By how much samples are farther off than allowed, and how far all are, in what is allowed."""
+        share = np.nan_to_num(_off_path(time[rest], path[rest]) / allowed[rest])
+        return float(np.maximum(share - 1.0, 0.0).sum()), float(share.sum())
 
     every = rest = np.arange(len(path))
-    left = excess(shares(rest))
+    left, _ = excess(rest)
     while left > 0 and 2 * len(rest) > len(every):
-        fewer = [
-            np.delete(rest, np.s_[begin : begin + size])
-            for size in range(1, _AWAY + 1)
-            for begin in range(len(rest) - size + 1)
-        ]
-        share = [shares(one) for one in fewer]
-        size, excesses = len(rest) - np.array(list(map(len, fewer))), np.array(list(map(excess, share)))
-        # the shortest stretch that is enough and leaves the smoothest path; else the one that helps most for its length
-        enough = np.flatnonzero((excesses == 0.0) & (size == np.min(size[excesses == 0.0], initial=_AWAY + 1)))
-        best = int(min(enough, key=lambda i: share[i].sum(), default=np.argmax((left - excesses) / size)))
-        rest, left = fewer[best], excesses[best]
+        tried = []
+        for size in range(1, _AWAY + 1):
+            for begin in range(len(rest) - size + 1):
+                fewer = np.delete(rest, np.s_[begin : begin + size])
+                over, off = excess(fewer)
+                # the shortest stretch that is enough and leaves the smoothest path; else what helps most for its length
+                tried.append(((over > 0, (over - left) / size if over else size, off), over, fewer))
+        _, left, rest = min(tried, key=lambda one: one[0])
     wrong = every[:0] if left > 0 else np.setdiff1d(every, rest)
 
     def goes_on(at: int, nodes: Int[np.ndarray, " 2"]) -> bool:

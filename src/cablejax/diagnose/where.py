@@ -119,7 +119,7 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
     def size(mask) -> float:
         return float(np.nan_to_num(above(np.where(mask, squares, np.nan), noise)))
 
-    inflation = variance_inflation(whitened, log, regimes.hold)
+    inflation, parts = variance_inflation(whitened, log, regimes.hold), _along_and_across(residual, nominal)
     where = Where(
         gap_mm=size(True),
         smallest_mm=smallest_gap(noise, 2 * everywhere.sum() / inflation, LEVEL),
@@ -131,8 +131,8 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         heat=np.sqrt(squared),
         horizons_mm=_horizons(log, valid, size),
         regimes={name: size(mask[..., None]) for name, mask in regimes.masks.items()},
-        frames=_frames(residual, noise, nominal),
-        along_share=_along_share(residual, noise, nominal),
+        frames=_frames(residual, noise, nominal, parts),
+        along_share=_along_share(parts, noise),
         contrasts=_contrasts(squares, noise, size, regimes, motion, arclength),
         regime_masks=regimes.masks,
     )
@@ -212,27 +212,26 @@ def _horizons(log: GapLog, valid, size) -> dict[float, float]:
     return result
 
 
-def _tangents(nominal) -> np.ndarray:
-    along = np.gradient(nominal, axis=2)
-    return along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
+def _along_and_across(residual, nominal) -> tuple[np.ndarray, np.ndarray]:
+    """Parts of the residual along the simulated cable and across it [m], shape [E, T, N] each."""
+    tangent = np.gradient(nominal, axis=2)
+    tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-12)
+    return (residual * tangent).sum(axis=-1), (residual * quarter_turn(tangent)).sum(axis=-1)
 
 
-def _along_share(residual, noise, nominal) -> float | None:
-    tangent = _tangents(nominal)
-    parts = (residual * tangent).sum(axis=-1), (residual * quarter_turn(tangent)).sum(axis=-1)
+def _along_share(parts, noise) -> float | None:
+    """See `Where`, from `_along_and_across`."""
     along, across = (max(float(np.nanmean(part**2 - noise**2)), 0.0) for part in parts)
     return along / (along + across) if along + across > 0 else None
 
 
-def _frames(residual, noise, nominal) -> dict[str, float]:
+def _frames(residual, noise, nominal, parts) -> dict[str, float]:
     """Share of the squared gap that a constant error in each frame explains, noise taken out of both."""
     seen = np.isfinite(residual).all(axis=-1)
     floor = np.broadcast_to(noise**2, seen.shape)
     power = (np.where(seen[..., None], residual**2, 0.0)).sum() - 2 * floor[seen].sum()
     if power <= 2 * floor[seen].sum() * (NOISE_TOLERANCE - 1):
         return {}
-    tangent = _tangents(nominal)
-    normal = quarter_turn(tangent)
     count = np.maximum(seen.sum(axis=(0, 1)), 1)
 
     def of_means(parts) -> float:
@@ -242,7 +241,7 @@ def _frames(residual, noise, nominal) -> dict[str, float]:
             explained += float((count * mean**2).sum() - (noise**2).sum())
         return explained
 
-    body = of_means([(residual * tangent).sum(axis=-1), (residual * normal).sum(axis=-1)])
+    body = of_means(parts)
     table = of_means([residual[..., 0], residual[..., 1]])
     x, y = nominal[seen].T
     ones, zeros = np.ones_like(x), np.zeros_like(x)
