@@ -209,7 +209,9 @@ class SpatialCable(Simulator):
             index = np.arange(begin, min(begin + size, len(windows)))
             full = np.concatenate([index, np.full(size - len(index), index[0])])
             part = windows.chosen(full)
-            found = run(values[full], *more, part.position, part.frames, part.keypoints[:, :2])
+            # up to the last sample that is recorded in one of them
+            wanted = 1 + np.flatnonzero(part.valid.any(axis=0))[-1]
+            found = run(values[full], *more, wanted, part.position, part.frames, part.keypoints[:, :2])
             return jax.tree.map(lambda a: np.asarray(a)[: len(index)], found)
 
         with concurrent.futures.ThreadPoolExecutor(available_cores()) as pool:
@@ -268,13 +270,13 @@ def errors(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[n
 
 @functools.lru_cache(maxsize=8)
 def _compiled(rod: Rod, layout: Layout, interval: float):
-    def one(values, position, frames, seen):
-        found = rod.rollout(layout.physics(values), position, frames, seen, interval)
+    def one(values, wanted, position, frames, seen):
+        found = rod.rollout(layout.physics(values), position, frames, seen, interval, wanted)
         reached = jnp.arange(found.points.shape[0]) < found.solved
         return jnp.where(reached[:, None, None], found.points, jnp.nan), found.result
 
-    def batch(values, *inputs):
-        return jax.vmap(one)(values, *inputs)
+    def batch(values, wanted, *inputs):
+        return jax.vmap(one, (0, None, 0, 0, 0))(values, wanted, *inputs)
 
     def both(values, directions, *inputs):
         def tangent(direction):

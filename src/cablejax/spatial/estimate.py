@@ -26,8 +26,9 @@ from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.refits import independent
-from cablejax.spatial.cable import TWISTED, SpatialCable, typical_error
+from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.effects import Layout
+from cablejax.spatial.growing import beginning
 
 # Predictions may be off by what edges and time steps of finite length do; values are not to make up for it. Fits are
 # made in rounds of at most `_STEPS` steps, predictions corrected before each, until no value moves by this share of its
@@ -165,7 +166,7 @@ def estimate(
 
     Args:
         cable: in the windows to fit.
-        starts: explanations to start from, with some of the effects; the first round goes on from each.
+        starts: explanations with some of the effects; the fit begins at the best of them, see `beginning`.
         tried: names of the effects that are free.
         progress: called with a line of text.
     """
@@ -180,12 +181,11 @@ def estimate(
         cable = cable.some(_TWISTED_WINDOWS)
     progress(f"all effects free: {len(cable.windows)} windows")
     tolerance, rounds, steps = _TOLERANCE * len(cable.windows), 0, _STEPS
-    start, before = starts[0], np.inf
+    start, before = beginning(cable, starts), np.inf
     while True:
         rounds += 1
         evidence = cable.corrected(start).evidence()
-        fits = improve(evidence, evaluate(evidence, starts), max_iterations=steps, tolerance=tolerance)
-        fit = min(fits, key=lambda fit: fit.cost(evidence))
+        (fit,) = improve(evidence, evaluate(evidence, [start]), max_iterations=steps, tolerance=tolerance)
         error = np.hypot(*(np.linalg.norm(rows, axis=0) for rows in _rows(evidence, fit)))
         moved = float((np.abs(fit.explanation.z - start.z) / error).max(initial=0.0))
         progress(f"corrected for finite edges and time steps: values move by up to {moved:.2f} standard errors")
@@ -197,7 +197,6 @@ def estimate(
         if settled or stalled or rounds == _ROUNDS:
             return dataclasses.replace(estimate_at(evidence, fit), settled=settled)
         start, before = fit.explanation, before if stuck else moved
-        starts = [start]
 
 
 def restarts(one: Explanation) -> list[Explanation]:
@@ -206,12 +205,6 @@ def restarts(one: Explanation) -> list[Explanation]:
     The search may have left those values in a bad minimum, in which a fit from 0 need not end.
     """
     return [one, one.moved(one.z, np.zeros_like(one.own))] if one.own.any() else [one]
-
-
-def best_start(cable: SpatialCable, one: Explanation, other: Explanation) -> Explanation:
-    """The start of `starts_from` that simulates the cable's windows best."""
-    evidence = cable.evidence()
-    return min(starts_from(one, other), key=lambda start: typical_error(evidence, start))
 
 
 def starts_from(one: Explanation, other: Explanation) -> list[Explanation]:

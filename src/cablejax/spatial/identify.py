@@ -25,7 +25,7 @@ from cablejax.simulate.rod import Rod
 from cablejax.spatial.accidents import moderated
 from cablejax.spatial.cable import GOOD_FIT, TWISTED, SpatialCable, bounded
 from cablejax.spatial.effects import Layout, effect_names, effects_of
-from cablejax.spatial.estimate import Estimate, best_start, estimate, restarts
+from cablejax.spatial.estimate import Estimate, estimate, restarts, starts_from
 from cablejax.spatial.memory import Memory, fingerprint
 from cablejax.spatial.search import Step, accepted_effects, halves, search, tried_with, unseen_error
 from cablejax.spatial.windows import Windows
@@ -192,10 +192,7 @@ def _estimates(cable: SpatialCable, first, begun, tried, memory: Memory, progres
     for part, word in parts[len(done) :]:
         progress(f"fitting {word}")
         own = cable.chosen(np.flatnonzero(part))
-        if len(done) < 2:
-            starts = restarts(begun[len(done)])
-        else:
-            starts = [best_start(own, done[0].explanation, done[1].explanation)]
+        starts = restarts(begun[len(done)]) if len(done) < 2 else starts_from(*(half.explanation for half in done))
         done.append(estimate(own, starts, tried, progress=progress))
         memory.keep("estimates", done)
     return done

@@ -30,6 +30,7 @@ from cablejax.diagnose.refits import dealt, independent
 from cablejax.spatial.accidents import compared, moderated, off
 from cablejax.spatial.cable import SpatialCable, mean_error, typical_error
 from cablejax.spatial.effects import SpatialEffect
+from cablejax.spatial.growing import beginning
 
 _FAILURES = 4
 _LEAST = 0.02
@@ -151,7 +152,7 @@ def tried_with(
     fits = []
     for start, (seen, _, _) in zip(starts, _parts(cable.trusting(before.error)), strict=True):
         evidence = seen.evidence()
-        fits += improve(evidence, evaluate(evidence, [start]), cable.plan.last_steps)
+        fits += improve(evidence, evaluate(evidence, [beginning(seen, [start])]), cable.plan.last_steps)
     fitted = fits[0].explanation, fits[1].explanation
     error = unseen_error(cable, fitted)
     accepted, chance = falls(before.error, error, cable.recording)

@@ -109,6 +109,7 @@ class Rod:
         frames: Float[Array | np.ndarray, "T 2 3 3"],
         seen: Float[Array | np.ndarray, "2 N 3"],
         interval: Float[Array, ""] | float,
+        wanted: Int[Array, ""] | int | None = None,
     ) -> Rollout:
         """Free markers at every sample; the first two are fits to `seen`, all others follow from the motion.
 
@@ -121,6 +122,7 @@ class Rod:
             frames: of the grippers, rows are axes in the world, the first along the cable.
             seen: free markers at the first two samples [m].
             interval: between samples [s].
+            wanted: so many samples are simulated, and the cable stays as it is at the last; None = all.
         """
         position, frames, seen = jnp.asarray(position), jnp.asarray(frames), jnp.asarray(seen)
         discrete = DiscreteRod.of(jax.tree.map(jnp.asarray, physics), self.n_edges)
@@ -129,18 +131,24 @@ class Rod:
         zero = jnp.zeros((), int)
         start = _Progress(motion, zero, zero + _WHOLE, ~found, jnp.zeros((), bool), zero)
 
-        def sample(progress, window):
+        def sample(progress, inputs):
+            window, go = inputs
+
             def step(progress, index):
                 return self._march(discrete, interval, progress, window, index), None
 
-            progress, _ = jax.lax.scan(step, progress, jnp.arange(self.substeps))
+            def advanced(progress):
+                return jax.lax.scan(step, progress, jnp.arange(self.substeps))[0]
+
+            progress = jax.lax.cond(go, advanced, lambda at: at, progress)
             points = discrete.weights @ progress.motion.nodes
             if self.twisting:
                 points = points + discrete.marker_offsets(progress.motion.directors, progress.motion.tangents)
             return progress, (points, progress.lost)
 
         grippers = _windows(jnp.concatenate([held, side], axis=1))
-        progress, (points, lost) = jax.lax.scan(sample, start, grippers)
+        go = jnp.arange(2, len(position)) < (len(position) if wanted is None else wanted)
+        progress, (points, lost) = jax.lax.scan(sample, start, (grippers, go))
         result = jnp.where(progress.lost, RodResult.UNSOLVED, jnp.where(progress.coarse, RodResult.COARSE, 0))
         solved = jnp.where(found, 2 + jnp.sum(~lost), 0)
         return Rollout(jnp.concatenate([first_points, points]), result, solved, progress.attempts)

@@ -1,0 +1,44 @@
+"""Where fits to whole windows begin: at fits to their beginnings, which grow.
+
+The longer a motion is simulated, the rougher is its error in the parameters: oscillations are a whole period off, a
+cable swings over or does not, and a fit from afar ends in one of many minima. The first quarter of the windows has far
+fewer of them, and what fits it is close to what fits the first half, and that to what fits all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+
+from cablejax.diagnose.fit import evaluate, improve
+from cablejax.diagnose.protocol import Explanation
+from cablejax.spatial.cable import SpatialCable, typical_error
+
+_SHARES = (0.25, 0.5)
+
+
+def beginning(cable: SpatialCable, starts: Sequence[Explanation]) -> Explanation:
+    """The best start, or what it becomes by fits to growing beginnings of the windows if that is better.
+
+    Args:
+        cable: in the windows to fit.
+        starts: the best one simulates whole windows with the least `typical_error`.
+    """
+    error = functools.partial(typical_error, cable.evidence())
+    best = min(starts, key=error)
+    return min(best, _grown(cable, best), key=error)
+
+
+def _grown(cable: SpatialCable, start: Explanation) -> Explanation:
+    """What a start becomes by fits of its parameters to growing beginnings of the windows."""
+    for share in _SHARES:
+        valid = cable.windows.valid
+        early = np.arange(valid.shape[1]) < share * valid.shape[1]
+        part = cable.on(dataclasses.replace(cable.windows, valid=valid & early))
+        evidence = part.evidence()
+        (fit,) = improve(evidence, evaluate(evidence, [start]), part.plan.last_steps)
+        start = fit.explanation
+    return start
