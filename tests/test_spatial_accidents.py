@@ -181,11 +181,11 @@ def test_what_is_shorter_than_a_window_is_said():
 
 
 def torn(episodes: int = 4):
-    """A log whose gripper 1 is 0.6 m too far away in episode 1, from 0.8 s to 0.9 s."""
+    """A log whose gripper 1 is 0.6 m too far away in episode 1, from 0.8 s to 1.0 s: longer than a misreading."""
     log = cases.recording(episodes)
     points, pose = log.keypoints.copy(), log.gripper_pose.copy()
-    points[1, 40:45, -2:, 0] += 0.6
-    pose[1, 40:45, 1, 0] += 0.6
+    points[1, 40:50, -2:, 0] += 0.6
+    pose[1, 40:50, 1, 0] += 0.6
     return dataclasses.replace(log, keypoints=points, gripper_pose=pose)
 
 
