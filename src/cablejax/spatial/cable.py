@@ -134,7 +134,7 @@ class SpatialCable(Simulator):
         return sum(len(e.null) for e in self.layout.effects if e.own and e.name in one.names)
 
     def motion(self, one: Explanation) -> Float[np.ndarray, "W T F 3"]:
-        """Free markers at every sample [m], still after the last recorded one; NaN from where on it was not solved."""
+        """Free markers at every sample [m], constant after the last recorded one; NaN after the last solved one."""
         return self.rollouts(one)[0]
 
     def rollouts(self, one: Explanation, episodes=None) -> tuple[Float[np.ndarray, "E T F 3"], Int[np.ndarray, "E"]]:

@@ -2,13 +2,12 @@
 
 The longer a motion is simulated, the rougher is its error in the parameters: oscillations are a whole period off, a
 cable swings over or does not, and a fit from afar ends in one of many minima. The first quarter of the windows has far
-fewer of them, and what fits it is close to what fits the first half, and that to what fits all.
+fewer of them. What fits it is close to what fits the first half, and that is close to what fits all.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,9 +26,11 @@ def beginning(cable: SpatialCable, starts: Sequence[Explanation]) -> Explanation
         cable: in the windows to fit.
         starts: the best one simulates whole windows with the least `typical_error`.
     """
-    error = functools.partial(typical_error, cable.evidence())
-    best = min(starts, key=error)
-    return min(best, _grown(cable, best), key=error)
+    whole = cable.evidence()
+    errors = [typical_error(whole, start) for start in starts]
+    best = starts[int(np.argmin(errors))]
+    grown = _grown(cable, best)
+    return grown if typical_error(whole, grown) < min(errors) else best
 
 
 def _grown(cable: SpatialCable, start: Explanation) -> Explanation:
