@@ -247,10 +247,10 @@ class SpatialCable(Simulator):
 
 
 def mean_error(predicted: Float[np.ndarray, "W T F 3"], observed: Float[np.ndarray, "W T F 3"]) -> np.ndarray:
-    """Mean absolute error of each window's observed coordinates [m], shape [W]."""
+    """Mean absolute error of each window's observed coordinates [m], shape [W]; 0 where none is observed."""
     seen = np.isfinite(observed)
     off = np.where(seen, bounded(predicted - observed), 0.0)
-    return off.sum(axis=(1, 2, 3)) / seen.sum(axis=(1, 2, 3))
+    return off.sum(axis=(1, 2, 3)) / np.maximum(seen.sum(axis=(1, 2, 3)), 1)
 
 
 def typical_error(evidence: Evidence, one: Explanation) -> float:

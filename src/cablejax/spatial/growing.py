@@ -33,12 +33,17 @@ def beginning(cable: SpatialCable, starts: Sequence[Explanation]) -> Explanation
     return grown if typical_error(whole, grown) < min(errors) else best
 
 
+def early(cable: SpatialCable, share: float = _SHARES[0]) -> SpatialCable:
+    """The cable in the beginnings of its windows, of this share of their length."""
+    valid = cable.windows.valid
+    begun = np.arange(valid.shape[1]) < share * valid.shape[1]
+    return cable.on(dataclasses.replace(cable.windows, valid=valid & begun))
+
+
 def _grown(cable: SpatialCable, start: Explanation) -> Explanation:
     """What a start becomes by fits of its parameters to growing beginnings of the windows."""
     for share in _SHARES:
-        valid = cable.windows.valid
-        early = np.arange(valid.shape[1]) < share * valid.shape[1]
-        part = cable.on(dataclasses.replace(cable.windows, valid=valid & early))
+        part = early(cable, share)
         evidence = part.evidence()
         (fit,) = improve(evidence, evaluate(evidence, [start]), part.plan.last_steps)
         start = fit.explanation

@@ -10,8 +10,8 @@ minimum and shows how much each effect contributes; from there all effects are f
 Fits, priors, losses and parameters of single recordings are those of every diagnosis, but the search differs.
 `cablejax.diagnose.search` fits all candidates of a step and uses the likelihood of whole episodes, calibrated on
 labelled logs. Here one fit takes as long as that whole search, and there are no labelled logs. Candidates are therefore
-ordered by the decrease that one Gauss-Newton step predicts and judged by resampling. This gives no probabilities, so
-none are reported.
+ordered by what one Gauss-Newton step achieves in the beginnings of the windows (`growing`), and judged by resampling.
+This gives no probabilities, so none are reported.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from cablejax.diagnose.refits import dealt, independent
 from cablejax.spatial.accidents import compared, moderated, off
 from cablejax.spatial.cable import SpatialCable, mean_error, typical_error
 from cablejax.spatial.effects import SpatialEffect
-from cablejax.spatial.growing import beginning
+from cablejax.spatial.growing import beginning, early
 
 _FAILURES = 4
 _LEAST = 0.02
@@ -187,11 +187,12 @@ def _starts(
 ) -> tuple[tuple[Explanation, Explanation], float]:
     """Where fits with one more effect may begin, per half, and the error on what each has not seen.
 
-    Seen in few windows: this says what to try first, and the fits correct it.
+    Seen in the beginnings of few windows: this says what to try first, and the fits correct it. Whole windows of a soft
+    cable that swings differ in phase under any parameter, so there what only calms it down would come first.
     """
     found, total = [], 0.0
     for base, parts in zip(before, _parts(cable), strict=True):
-        seen, other = (part.some(_PROMISED).evidence() for part in parts[:2])
+        seen, other = (early(part.some(_PROMISED)).evidence() for part in parts[:2])
         found.append(_start(seen, base, effect))
         total += typical_error(other, found[-1])
     return (found[0], found[1]), total
