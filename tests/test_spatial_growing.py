@@ -14,6 +14,7 @@ from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable, typical_error
 from cablejax.spatial.growing import beginning
 from cablejax.spatial.identify import layout_of
+from cablejax.spatial.search import accepted_effects, search
 from cablejax.spatial.windows import windows_of
 
 _FOUND = ("bending_stiffness", "bending_damping")
@@ -67,6 +68,14 @@ def test_windows_too_short_to_have_beginnings_are_fitted_as_they_are(cable):
     start = _with(few, 2.4, 0.03)
     begun = beginning(few, [start])
     assert typical_error(few.evidence(), begun) <= typical_error(few.evidence(), start)
+
+
+@pytest.mark.slow
+def test_what_explains_a_soft_cable_is_tried_before_what_calms_it_down(cable):
+    soft = cable.on(dataclasses.replace(cable.windows, keypoints=cable.motion(_with(cable, 0.02, 0.003))))
+    steps = search(soft, ["viscous_drag", "bending_stiffness"])
+    assert steps[1].effect == "bending_stiffness"
+    assert accepted_effects(steps) == ["bending_stiffness"]
 
 
 def test_nothing_is_simulated_after_the_last_recorded_sample(cable):
