@@ -15,9 +15,9 @@ import scipy.optimize
 from jaxtyping import Bool, Float, Int
 
 from cablejax.diagnose.diagnosis import ParameterEstimate
-from cablejax.diagnose.evidence import held_out_together
 from cablejax.diagnose.log_faults import integrated, scatter_of
 from cablejax.diagnose.posterior import QUANTILE
+from cablejax.diagnose.refits import FOLDS, dealt
 from cablejax.effects.arms import lagged
 from cablejax.types import ROTATION_WEIGHT
 
@@ -153,9 +153,9 @@ class _Arms:
 
         Of many motions, several are left out together.
         """
-        result, groups = self.predicted(effects, theta), held_out_together(motion)
-        for group in groups if len(groups) > 1 else ():
-            rest = self.chosen(np.setdiff1d(np.arange(len(motion)), group))
+        result, part_of = self.predicted(effects, theta), dealt(motion, FOLDS)
+        for part in range(part_of.max() + 1) if part_of.any() else ():
+            group, rest = np.flatnonzero(part_of == part), self.chosen(np.flatnonzero(part_of != part))
             inside = np.clip(theta, [1e-3] * len(theta), [2.9] * len(theta))
             result[group] = self.chosen(group).predicted(effects, rest.fit(effects, [inside]).x)
         return result

@@ -17,8 +17,6 @@ from cablejax.diagnose.protocol import Explanation, Simulator
 
 _ALIKE = 0.05
 """Motions whose gripper poses differ by less than this share of the cable's length, root mean square, are one."""
-_FOLDS = 6
-"""Parts of the episodes that are held out one after the other, at most."""
 _ARM = 0.15
 """Share of the cable's length that a radian of a gripper counts for there."""
 
@@ -162,13 +160,6 @@ def repeated_motions(
 def episodes_by_motion(motion: Int[np.ndarray, "E"]) -> list[Int[np.ndarray, "_"]]:
     """The episodes of each motion, in the order of their numbers."""
     return [np.flatnonzero(motion == first) for first in np.unique(motion)]
-
-
-def held_out_together(motion: Int[np.ndarray, "E"]) -> list[Int[np.ndarray, "_"]]:
-    """Parts of the episodes, as large as each other, each to be held out by a fit to the others; by whole motions."""
-    motions = episodes_by_motion(motion)
-    folds = np.array_split(np.arange(len(motions)), min(len(motions), _FOLDS))
-    return [np.sort(np.concatenate([motions[i] for i in fold])) for fold in folds]
 
 
 def share_of_motion(motion: Int[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:

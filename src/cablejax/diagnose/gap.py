@@ -7,10 +7,10 @@ from jaxtyping import Float, Int
 
 from cablejax.diagnose.belief import level
 from cablejax.diagnose.diagnosis import Gap
-from cablejax.diagnose.evidence import Evidence, episodes_by_motion, held_out_together
+from cablejax.diagnose.evidence import Evidence, episodes_by_motion
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Plan
-from cablejax.diagnose.refits import independent
+from cablejax.diagnose.refits import FOLDS, dealt, independent
 from cablejax.diagnose.search import without_one
 
 _HORIZONS = (1.0, 2.0, 5.0, 10.0)
@@ -26,28 +26,27 @@ def held_out_predictions(evidence: Evidence, best: Fit) -> tuple[Float[np.ndarra
     Episodes that repeat one another are held out together. An effect that the other episodes do not show is left out:
     nothing would be known of it before this episode.
     """
-    n_episodes, motions = len(evidence.motion), episodes_by_motion(evidence.motion)
     seen = tuple(np.flatnonzero(evidence.count).tolist())
     if best.refits is not None:
         result = np.empty_like(evidence.nominal)
         for one, rows in zip(best.refits.explanations, best.refits.left_out, strict=True):
             result[rows] = evidence.restricted(rows).predict([one])[0]
         return result, seen
-    if not best.explanation.terms or len(motions) == 1:
-        return evidence.predict([best.explanation])[0], seen if len(motions) > 1 else ()
-    groups = held_out_together(evidence.motion)
+    part_of = dealt(evidence.motion, FOLDS)
+    if not best.explanation.terms or not part_of.any():
+        return evidence.predict([best.explanation])[0], seen if part_of.any() else ()
     # the sums of a fit are those of its episodes: what is left out needs no simulation of its own
     simpler, chosen = evaluate(evidence, without_one(best.explanation)), []
-    for group in groups:
-        rows = np.setdiff1d(np.arange(n_episodes), group)
+    for part in range(part_of.max() + 1):
+        rows = np.flatnonzero(part_of != part)
         rest, whole = evidence.restricted(rows), best.restricted(rows)
         (fit,) = improve(rest, [whole], _FOLD_STEPS, tolerance=Plan.tolerance)
         least = min((other.restricted(rows) for other in simpler), key=lambda other: other.cost(rest))
         chosen.append(least if least.cost(rest) < whole.cost(rest) + _WORTH else fit)
     every = evidence.predict([fit.explanation for fit in chosen])
     result = np.empty_like(evidence.nominal)
-    for group, predicted in zip(groups, every, strict=True):
-        result[group] = predicted[group]
+    for part, predicted in enumerate(every):
+        result[part_of == part] = predicted[part_of == part]
     return result, seen
 
 

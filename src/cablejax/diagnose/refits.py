@@ -17,6 +17,9 @@ from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, Refits, evaluate, improve
 from cablejax.diagnose.protocol import Explanation
 
+FOLDS = 6
+"""Parts of the episodes that are held out one after the other, at most, where a plan does not say how many."""
+
 
 def dealt(group: Int[np.ndarray, "E"], parts: int) -> Int[np.ndarray, "E"]:
     """The part that each episode falls to: groups are dealt out whole, the largest first to the smallest part."""
