@@ -20,7 +20,10 @@ def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
     Raises:
         ValueError: the file is no verdict, or not on a cable on a table, or it names no effect ("none" and "unknown").
     """
-    verdict = read_verdict_json(path)
+    return _named(read_verdict_json(path), path)
+
+
+def _named(verdict: Mapping[str, Any], path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
     if (dimension := verdict.get("dimension", 2)) != 2:
         what = "a cable in space" if dimension == 3 else "something other than a cable on a table"
         raise ValueError(
@@ -47,8 +50,8 @@ def posterior_of_verdict(path: str | os.PathLike[str]) -> tuple[tuple[GivenEffec
     Raises:
         ValueError: as `effects_of_verdict`.
     """
-    named, verdict = effects_of_verdict(path), read_verdict_json(path)
-    posterior = verdict.get("posterior") or []
+    verdict = read_verdict_json(path)
+    named, posterior = _named(verdict, path), verdict.get("posterior") or []
     try:
         drawn = tuple(
             tuple(GivenEffect(one["name"], tuple(one["parameters"].items())) for one in draw) for draw in posterior
