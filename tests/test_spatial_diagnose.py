@@ -23,7 +23,7 @@ from cablejax.simulate.rod.clamps import frames_along
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock, thinned, with_poses_in_time
 from cablejax.spatial.diagnose import _equivalent, _ranking, diagnose_space
-from cablejax.spatial.gap import OWN, in_log, own_error, smallest_gap, where_of
+from cablejax.spatial.gap import OWN, in_log, is_gap, own_error, smallest_gap, where_of, with_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import TWISTED, Identified, _twisted, layout_of
 from cablejax.spatial.named import _shown
@@ -290,12 +290,48 @@ def test_noise_in_the_beginning_of_a_window_and_few_edges_make_no_gap():
         SpatialCable(Rod(edges, twisting=False), layout_of(windows, cases.NOMINAL), windows) for edges in (20, 32)
     )
     coarse, fine = few.motion(explanation()), many.motion(explanation())
-    edges, some, more = (own_error(few, coarse, noise) for noise in (0.0, 1e-4, 5e-4))
+    edges, some, more = (own_error(few, explanation(), noise) for noise in (0.0, 1e-4, 5e-4))
     off = np.sqrt(np.mean((coarse - fine) ** 2))
     # a part 1.6 squared of it is left with the finer one
-    assert edges == pytest.approx(off / (1 - 1 / 1.6**2), rel=0.4) and own_error(many, fine, 0.0) < 0.6 * edges
+    assert edges == pytest.approx(off / (1 - 1 / 1.6**2), rel=0.4) and own_error(many, explanation(), 0.0) < 0.6 * edges
     assert np.sqrt(more**2 - edges**2) == pytest.approx(5 * np.sqrt(some**2 - edges**2), rel=0.2)
     assert smallest_gap(5e-4, windows, more) == pytest.approx(np.hypot(1.5 * more, smallest_gap(5e-4, windows)))
+
+
+def _softly_damped(times: int) -> tuple[SpatialCable, np.ndarray]:
+    """A soft cable that swings so many times as long, seen without noise, and its motion if it were not damped."""
+    windows = windows_of(cases.recording())
+    longer = {
+        name: np.concatenate([a, np.flip(a, axis=1), a][:times], axis=1)
+        for name in ("keypoints", "position", "frames", "valid")
+        for a in [getattr(windows, name)]
+    }
+    windows = dataclasses.replace(windows, **longer)
+    cable = SpatialCable(Rod(20, 1, twisting=False), layout_of(windows, 0.02 * cases.NOMINAL), windows)
+    damped = (
+        (cable.layout.named(name), 0, (value,)) for name, value in (("bending_damping", 0.03), ("viscous_drag", 0.5))
+    )
+    seen = dataclasses.replace(windows, keypoints=cable.motion(explanation(*damped)))
+    return cable.on(seen), cable.motion(explanation())
+
+
+def test_a_gap_shows_before_the_nominal_cable_amplifies_noise():
+    noise = 3e-4
+    short, nominal = _softly_damped(1)
+    compared, smallest, own = with_gap(short, nominal, noise)
+    assert compared.windows.valid.sum() == short.windows.valid.sum() and is_gap(nominal, compared.windows, smallest)
+    assert smallest > own == own_error(short, explanation(), noise)
+
+    long, nominal = _softly_damped(3)
+    assert not is_gap(nominal, long.windows, smallest_gap(noise, long.windows, own_error(long, explanation(), noise)))
+    compared, smallest, _ = with_gap(long, nominal, noise)
+    assert compared.windows.valid.sum() <= 0.5 * long.windows.valid.sum()
+    assert is_gap(nominal, compared.windows, smallest)
+
+    # what the nominal cable explains has no gap, however short
+    same = long.on(dataclasses.replace(long.windows, keypoints=nominal))
+    compared, smallest, _ = with_gap(same, nominal, noise)
+    assert compared.windows.valid.sum() == same.windows.valid.sum() and not is_gap(nominal, compared.windows, smallest)
 
 
 @pytest.mark.parametrize("late", [10, -7, 3.4])

@@ -20,7 +20,7 @@ from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.provenance import package_versions
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
-from cablejax.spatial.cable import SpatialCable, errors
+from cablejax.spatial.cable import GOOD_FIT, SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock, with_poses_in_time
 from cablejax.spatial.effects import GRIP
 from cablejax.spatial.gap import (
@@ -32,6 +32,7 @@ from cablejax.spatial.gap import (
     smallest_gap,
     squares,
     where_of,
+    with_gap,
 )
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import EDGES, Identified, identify, layout_of
@@ -82,7 +83,7 @@ def diagnose_space(
     log, shifted = with_poses_in_time(log)
     log = with_roll(log)
     windows, left_out = _to_fit(log)
-    longest = round(float(windows.valid.sum(axis=1).max() * windows.interval), 1)
+    longest = _seconds(windows)
     cable = log.meta["cable"]
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
     stiffness = cable["bending_stiffness_n_m2"] / density
@@ -97,13 +98,14 @@ def diagnose_space(
     before, (after, results) = found.cable.motion(explanation()), found.unseen(with_both_drags(named))
     lost, error, use = _simulated(after, windows)
     kept_windows = found.cable.chosen(use)
-    smallest = smallest_gap(noise, windows, own := own_error(kept_windows, before[use], noise))
-    gap = gap_of(before[use], after[use], kept_windows, noise, smallest)
+    compared, smallest, own = with_gap(kept_windows, before[use], noise)
+    gap = gap_of(before[use], after[use], compared, noise, smallest)
     equivalent = _equivalent(found, named)
-    verdict = _verdict(gap, 1e3 * smallest, named, equivalent)
+    own_after = own_error(compared, found.everything.with_only(with_both_drags(named)), noise)
+    verdict = _verdict(gap, 1e3 * smallest_gap(noise, windows, own_after), named, equivalent)
     share = gap.shrinkage
     if verdict == "unknown":  # each effect may be absent: by all of them together
-        share = gap_of(before[use], found.unseen()[0][use], kept_windows, noise, smallest).shrinkage
+        share = gap_of(before[use], found.unseen()[0][use], compared, noise, smallest).shrinkage
     if verdict in ("none", "unknown"):
         effects = ()
     offset = ParameterEstimate(constant_offset(after[use], kept_windows.windows), None, "m")
@@ -123,7 +125,7 @@ def diagnose_space(
             *resampled,
             *shifted,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(windows, left_out, found, own, hides=verdict == "none"),
+            *_caveats(windows, left_out, found, _seconds(compared.windows), own, own_after),
         ),
         log=log,
         nominal=nominal,
@@ -134,6 +136,11 @@ def diagnose_space(
         settings={"edges": edges, "window_s": longest, **package_versions(("jax",)), "devices": jax.default_backend()},
         identified=found,
     )
+
+
+def _seconds(windows: Windows) -> float:
+    """Length of the longest window [s]."""
+    return round(float(windows.valid.sum(axis=1).max() * windows.interval), 1)
 
 
 def _to_fit(log: GapLog) -> tuple[Windows, int]:
@@ -212,7 +219,7 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
     return tuple(ranked)
 
 
-def _caveats(windows, left_out, found, own, *, hides: bool) -> tuple[str, ...]:
+def _caveats(windows, left_out, found, compared_s, own, own_after) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight. Stiffness, drag and added masses are estimated "
         "relative to the linear density of the cable with its markers, and a wrong density (linear_density) is not "
@@ -243,12 +250,20 @@ def _caveats(windows, left_out, found, own, *, hides: bool) -> tuple[str, ...]:
             f"{np.sqrt((grips**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen "
             "are predicted with the mean."
         )
+    if compared_s < _seconds(windows):
+        result.append(
+            "The nominal cable amplifies the noise in the first two samples of each window until it moves as far from "
+            f"itself as from the recording. The gap is therefore that of the first {compared_s:g} s of each window."
+        )
     if own > OWN:
         result.append(
             "Noise in the first two samples of each window and the edges of the simulated cable alone cause errors of "
-            f"{1e3 * own:.1f} mm. They are part of the gap after; errors of up to 1.5 times this size do not count as "
-            "a gap."
-            + (" The values fitted to such motion may be off by more than their intervals: record slower ones." * hides)
+            f"{1e3 * own:.1f} mm of the nominal cable. Errors of up to 1.5 times this size do not count as a gap."
+        )
+    if own_after > GOOD_FIT:
+        result.append(
+            f"They cause {1e3 * own_after:.1f} mm of the explained cable, which are part of the gap after. The values "
+            "fitted to such motion may be off by more than their intervals: record slower ones."
         )
     if windows.smoothed:
         result.append(

@@ -12,7 +12,7 @@ on synthetic cables.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
 
 import jax
@@ -117,6 +117,10 @@ class Estimate:
     def shared(self) -> Float[np.ndarray, "P"]:
         """Values that all recordings share."""
         return self.explanation.vector(self.layout.effects)
+
+    def with_only(self, effects: Collection[str]) -> Explanation:
+        """What was fitted, without the effects that are not among these."""
+        return self.explanation.without(*(set(self.explanation.names) - set(effects)))
 
     def of(self, quantity: Quantity) -> Interval:
         """A quantity, its interval by its slope at the fitted values."""

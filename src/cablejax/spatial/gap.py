@@ -13,10 +13,11 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.gap import measure_gap
-from cablejax.diagnose.protocol import explanation
+from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.diagnose.where import HORIZONS, Where, above, sizes_of
 from cablejax.gaplog import labels
 from cablejax.spatial.cable import MORE_EDGES, SpatialCable, bounded
+from cablejax.spatial.growing import SHARES, early
 from cablejax.spatial.windows import Windows
 from cablejax.types import GapLog
 
@@ -41,20 +42,54 @@ def smallest_gap(noise: float, windows: Windows, own: float = 0.0) -> float:
     return float(np.linalg.norm([RESOLVABLE * noise, OWN * max(1.0, windows.arclength[-1]), SURE_OF_OWN * own]))
 
 
-def own_error(cable: SpatialCable, nominal: Float[np.ndarray, "W T F 3"], noise: float) -> float:
-    """The error of a coordinate that the cable's physics do not cause, root mean square [m].
+def with_gap(
+    cable: SpatialCable, nominal: Float[np.ndarray, "W T F 3"], noise: float
+) -> tuple[SpatialCable, float, float]:
+    """The cable in the longest beginnings of its windows in which there is a gap; in whole windows if there is none.
+
+    An undamped, soft nominal cable may amplify noise until it is as far off as the true cable. Its error before that
+    still shows what it has wrong.
+
+    Args:
+        cable: nominal, with the edges of predictions.
+        nominal: its motion in the windows [m].
+        noise: standard deviation of a coordinate [m].
+
+    Returns:
+        The cable, the smallest error there that counts as a gap [m], and the error of its own, see `own_error` [m].
+    """
+    found = []
+    for share in (1.0, *SHARES[::-1]):
+        part = early(cable, share)
+        own = own_error(part, explanation(), noise)
+        found.append((part, smallest_gap(noise, cable.windows, own), own))
+        if is_gap(nominal, part.windows, found[-1][1]):
+            return found[-1]
+    return found[0]
+
+
+def is_gap(nominal: Float[np.ndarray, "W T F 3"], windows: Windows, smallest: float) -> bool:
+    """Whether the nominal simulator's error in the windows, root mean square, is larger than this [m]."""
+    squared = squares(nominal, windows)
+    seen = np.isfinite(squared)
+    return bool(squared[seen].sum() > smallest**2 * seen.sum())
+
+
+def own_error(cable: SpatialCable, one: Explanation, noise: float) -> float:
+    """The error of a coordinate that no cause outside the simulation has, root mean square [m].
 
     A window begins with the shape and the velocity that its first two samples show, and noise makes both wrong: by as
     much noise again. And the rod has edges, whose error falls with the square of their number: by fewer.
 
     Args:
-        cable: nominal, with the edges of predictions.
-        nominal: its motion in the windows.
+        cable: with the edges of predictions.
+        one: what is simulated; nothing for the nominal cable.
         noise: standard deviation of a coordinate [m].
     """
+    motion = cable.motion(one)
 
     def off(other: SpatialCable) -> float:
-        apart = bounded(other.motion(explanation()) - nominal) ** 2
+        apart = bounded(other.motion(one) - motion) ** 2
         return float(np.sqrt(np.mean(apart[cable.windows.valid])))
 
     points = cable.windows.keypoints.copy()
@@ -127,7 +162,7 @@ def gap_of(
         interval=np.full(len(windows), windows.interval),
         length=windows.valid.sum(axis=1),
         held_out=tuple(range(len(windows))),
-        resolvable=bool(np.nanmean(squares(before, windows)) > smallest**2),
+        resolvable=is_gap(before, windows, smallest),
     )
     return dataclasses.replace(gap, held_out_episodes=tuple(sorted({int(e) for e in windows.episode})))
 

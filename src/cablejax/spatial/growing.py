@@ -16,7 +16,8 @@ from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import Explanation
 from cablejax.spatial.cable import SpatialCable, typical_error
 
-_SHARES = (0.25, 0.5)
+SHARES = (0.25, 0.5)
+"""Of windows: their beginnings, the shortest first."""
 
 
 def beginning(cable: SpatialCable, starts: Sequence[Explanation]) -> Explanation:
@@ -33,7 +34,7 @@ def beginning(cable: SpatialCable, starts: Sequence[Explanation]) -> Explanation
     return grown if typical_error(whole, grown) < min(errors) else best
 
 
-def early(cable: SpatialCable, share: float = _SHARES[0]) -> SpatialCable:
+def early(cable: SpatialCable, share: float = SHARES[0]) -> SpatialCable:
     """The cable in the beginnings of its windows, of this share of their length."""
     valid = cable.windows.valid
     begun = np.arange(valid.shape[1]) < share * valid.shape[1]
@@ -42,7 +43,7 @@ def early(cable: SpatialCable, share: float = _SHARES[0]) -> SpatialCable:
 
 def _grown(cable: SpatialCable, start: Explanation) -> Explanation:
     """What a start becomes by fits of its parameters to growing beginnings of the windows."""
-    for share in _SHARES:
+    for share in SHARES:
         part = early(cable, share)
         evidence = part.evidence()
         (fit,) = improve(evidence, evaluate(evidence, [start]), part.plan.last_steps)

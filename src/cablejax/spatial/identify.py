@@ -99,13 +99,8 @@ class Identified:
         Args:
             effects: that are simulated, with their values from the fit of all; None = all.
         """
-
-        def simulated(half):
-            one = half.explanation
-            left_out = set(one.names) - set(one.names if effects is None else effects)
-            return self.cable.rollouts(one.without(*left_out))
-
-        (one, ended), (other, other_ended) = map(simulated, self.halves)
+        ones = [half.explanation if effects is None else half.with_only(effects) for half in self.halves]
+        (one, ended), (other, other_ended) = map(self.cable.rollouts, ones)
         return np.where(self.first[:, None, None, None], other, one), np.where(self.first, other_ended, ended)
 
 
