@@ -72,7 +72,8 @@ def test_windows_too_short_to_have_beginnings_are_fitted_as_they_are(cable):
 
 @pytest.mark.slow
 def test_what_explains_a_soft_cable_is_tried_before_what_calms_it_down(cable):
-    soft = cable.on(dataclasses.replace(cable.windows, keypoints=cable.motion(_with(cable, 0.02, 0.003))))
+    true = explanation((cable.layout.named("bending_stiffness"), 0, (0.02,)))
+    soft = cable.on(dataclasses.replace(cable.windows, keypoints=cable.motion(true)))
     steps = search(soft, ["viscous_drag", "bending_stiffness"])
     assert steps[1].effect == "bending_stiffness"
     assert accepted_effects(steps) == ["bending_stiffness"]

@@ -2,8 +2,8 @@
 
 Recordings are split into two halves that are fitted separately throughout, and every window is scored with the fit of
 the other half. Each step tries the effect that is expected to reduce this error most. The effect stays if the error
-falls by more than a fiftieth, and in more than 84 % of resamples of the recordings, one standard error. The search ends
-after four effects in a row that do not stay. Windows that are lost or far off in every way are left out of the
+falls by more than a fiftieth, and in more than 84 % of resamples of the recordings, one standard error, and if it is
+not at its null value in both fits. The search ends after four effects in a row that do not stay. Windows that are lost or far off in every way are left out of the
 comparison, and effects that lose many do not count as failures (`accidents`). The search brings fits close to the right
 minimum and shows how much each effect contributes; from there all effects are fitted together (`estimate`).
 
@@ -155,7 +155,9 @@ def tried_with(
         fits += improve(evidence, evaluate(evidence, [beginning(seen, [start])]), cable.plan.last_steps)
     fitted = fits[0].explanation, fits[1].explanation
     error = unseen_error(cable, fitted)
-    accepted, chance = falls(before.error, error, cable.recording)
+    better, chance = falls(before.error, error, cable.recording)
+    # with the effect at its null value, what the fits gained is due to their further steps
+    accepted = better and any(_is_there(cable, name, one) for one in fitted)
     counts = compared(before.error, error)[1]
     word = "stays" if accepted else "does not help" if counts else "fails in many windows, not judged"
     accidents = f", {off(error).sum()} windows off" if off(error).any() else ""
@@ -163,6 +165,12 @@ def tried_with(
     what = f"{name} for {instead_of}" if instead_of else name
     progress(f"{what}: {was:.2f} -> {now:.2f} mm on unseen recordings{accidents}, {word}")
     return Step(name, accepted, fitted, error, chance, counts, instead_of)
+
+
+def _is_there(cable: SpatialCable, name: str, one: Explanation) -> bool:
+    """Whether an effect has other values than its null ones, common or of single recordings."""
+    effect, slots = cable.layout.named(name), cable.layout.slots(name)
+    return bool((one.vector(cable.layout.effects)[slots] != effect.null).any() or (effect.own and one.own.any()))
 
 
 def unseen_error(cable: SpatialCable, halves: tuple[Explanation, Explanation]) -> Float[np.ndarray, "W"]:
