@@ -3,9 +3,10 @@
 Recordings are split into two halves that are fitted separately throughout, and every window is scored with the fit of
 the other half. Each step tries the effect that is expected to reduce this error most. The effect stays if the error
 falls by more than a fiftieth, and in more than 84 % of resamples of the recordings, one standard error, and if it is
-not at its null value in both fits. The search ends after four effects in a row that do not stay. Windows that are lost or far off in every way are left out of the
-comparison, and effects that lose many do not count as failures (`accidents`). The search brings fits close to the right
-minimum and shows how much each effect contributes; from there all effects are fitted together (`estimate`).
+not at its null value in both fits. The search ends after four effects in a row that do not stay. Windows that are lost
+or far off in every way are left out of the comparison, and effects that lose many do not count as failures
+(`accidents`). The search brings fits close to the right minimum and shows how much each effect contributes; from there
+all effects are fitted together (`estimate`).
 
 Fits, priors, losses and parameters of single recordings are those of every diagnosis, but the search differs.
 `cablejax.diagnose.search` fits all candidates of a step and uses the likelihood of whole episodes, calibrated on
