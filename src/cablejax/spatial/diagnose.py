@@ -258,12 +258,13 @@ def _caveats(windows, left_out, found, compared_s, own, own_after) -> tuple[str,
     if own > OWN:
         result.append(
             "Noise in the first two samples of each window and the edges of the simulated cable alone cause errors of "
-            f"{1e3 * own:.1f} mm of the nominal cable. Errors of up to 1.5 times this size do not count as a gap."
+            f"the nominal cable of {1e3 * own:.1f} mm. Errors of up to 1.5 times this size do not count as a gap."
         )
     if own_after > GOOD_FIT:
         result.append(
-            f"They cause {1e3 * own_after:.1f} mm of the explained cable, which are part of the gap after. The values "
-            "fitted to such motion may be off by more than their intervals: record slower ones."
+            "Noise in the first two samples of each window alone causes errors of the explained cable of "
+            f"{1e3 * own_after:.1f} mm, which are part of the gap after. The values fitted to such motion may be off by "
+            "more than their intervals: record slower ones."
         )
     if windows.smoothed:
         result.append(

@@ -76,7 +76,7 @@ def is_gap(nominal: Float[np.ndarray, "W T F 3"], windows: Windows, smallest: fl
 
 
 def own_error(cable: SpatialCable, one: Explanation, noise: float) -> float:
-    """The error of a coordinate that no cause outside the simulation has, root mean square [m].
+    """The error of a coordinate that the simulation has by itself, root mean square [m].
 
     A window begins with the shape and the velocity that its first two samples show, and noise makes both wrong: by as
     much noise again. And the rod has edges, whose error falls with the square of their number: by fewer.

@@ -35,7 +35,7 @@ def beginning(cable: SpatialCable, starts: Sequence[Explanation]) -> Explanation
 
 
 def early(cable: SpatialCable, share: float = SHARES[0]) -> SpatialCable:
-    """The cable in the beginnings of its windows, of this share of their length."""
+    """The cable in the beginnings of its windows, of this share of the longest one's length."""
     valid = cable.windows.valid
     begun = np.arange(valid.shape[1]) < share * valid.shape[1]
     return cable.on(dataclasses.replace(cable.windows, valid=valid & begun))
