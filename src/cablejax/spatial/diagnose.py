@@ -263,8 +263,8 @@ def _caveats(windows, left_out, found, compared_s, own, own_after) -> tuple[str,
     if own_after > GOOD_FIT:
         result.append(
             "Noise in the first two samples of each window alone causes errors of the explained cable of "
-            f"{1e3 * own_after:.1f} mm, which are part of the gap after. The values fitted to such motion may be off by "
-            "more than their intervals: record slower ones."
+            f"{1e3 * own_after:.1f} mm, which are part of the gap after. The values fitted to such motion may be off "
+            "by more than their intervals: record slower ones."
         )
     if windows.smoothed:
         result.append(
