@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax
@@ -13,6 +14,7 @@ from cablejax.poses import twists
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.rod import Rod, RodPhysics
 from cablejax.simulate.rod.clamps import frames_along
+from cablejax.spatial.windows import Windows, windows_of
 from cablejax.types import GapLog
 
 INTERVAL = 0.02
@@ -107,6 +109,17 @@ def recording(episodes: int = 4, regripped: int | None = None) -> GapLog:
     log = gap_log_from_episodes(rows, cable, source="synthetic")
     log.meta["keypoint_arclength_m"] = arclength().tolist()
     return log
+
+
+def swinging(times: int) -> Windows:
+    """Windows of a motion there, back and there again, the first so many of the three."""
+    windows = windows_of(recording())
+    longer = {
+        name: np.concatenate([a, np.flip(a, axis=1), a][:times], axis=1)
+        for name in ("keypoints", "position", "frames", "valid")
+        for a in [getattr(windows, name)]
+    }
+    return dataclasses.replace(windows, **longer)
 
 
 def _quaternions(direction):

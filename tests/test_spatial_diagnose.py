@@ -290,23 +290,20 @@ def test_noise_in_the_beginning_of_a_window_and_few_edges_make_no_gap():
         SpatialCable(Rod(edges, twisting=False), layout_of(windows, cases.NOMINAL), windows) for edges in (20, 32)
     )
     coarse, fine = few.motion(explanation()), many.motion(explanation())
-    edges, some, more = (own_error(few, explanation(), noise) for noise in (0.0, 1e-4, 5e-4))
+    edges, some, more = (own_error(few, explanation(), coarse, noise) for noise in (0.0, 1e-4, 5e-4))
     off = np.sqrt(np.mean((coarse - fine) ** 2))
     # a part 1.6 squared of it is left with the finer one
-    assert edges == pytest.approx(off / (1 - 1 / 1.6**2), rel=0.4) and own_error(many, explanation(), 0.0) < 0.6 * edges
+    assert (
+        edges == pytest.approx(off / (1 - 1 / 1.6**2), rel=0.4)
+        and own_error(many, explanation(), fine, 0.0) < 0.6 * edges
+    )
     assert np.sqrt(more**2 - edges**2) == pytest.approx(5 * np.sqrt(some**2 - edges**2), rel=0.2)
     assert smallest_gap(5e-4, windows, more) == pytest.approx(np.hypot(1.5 * more, smallest_gap(5e-4, windows)))
 
 
 def _softly_damped(times: int) -> tuple[SpatialCable, np.ndarray]:
     """A soft cable that swings so many times as long, seen without noise, and its motion if it were not damped."""
-    windows = windows_of(cases.recording())
-    longer = {
-        name: np.concatenate([a, np.flip(a, axis=1), a][:times], axis=1)
-        for name in ("keypoints", "position", "frames", "valid")
-        for a in [getattr(windows, name)]
-    }
-    windows = dataclasses.replace(windows, **longer)
+    windows = cases.swinging(times)
     cable = SpatialCable(Rod(20, 1, twisting=False), layout_of(windows, 0.02 * cases.NOMINAL), windows)
     damped = (
         (cable.layout.named(name), 0, (value,)) for name, value in (("bending_damping", 0.03), ("viscous_drag", 0.5))
@@ -320,10 +317,12 @@ def test_a_gap_shows_before_the_nominal_cable_amplifies_noise():
     short, nominal = _softly_damped(1)
     compared, smallest, own = with_gap(short, nominal, noise)
     assert compared.windows.valid.sum() == short.windows.valid.sum() and is_gap(nominal, compared.windows, smallest)
-    assert smallest > own == own_error(short, explanation(), noise)
+    assert smallest > own == own_error(short, explanation(), nominal, noise)
 
     long, nominal = _softly_damped(3)
-    assert not is_gap(nominal, long.windows, smallest_gap(noise, long.windows, own_error(long, explanation(), noise)))
+    assert not is_gap(
+        nominal, long.windows, smallest_gap(noise, long.windows, own_error(long, explanation(), nominal, noise))
+    )
     compared, smallest, _ = with_gap(long, nominal, noise)
     assert compared.windows.valid.sum() <= 0.5 * long.windows.valid.sum()
     assert is_gap(nominal, compared.windows, smallest)

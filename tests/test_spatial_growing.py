@@ -15,7 +15,6 @@ from cablejax.spatial.cable import SpatialCable, typical_error
 from cablejax.spatial.growing import beginning
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.search import accepted_effects, search
-from cablejax.spatial.windows import windows_of
 
 _FOUND = ("bending_stiffness", "bending_damping")
 
@@ -23,13 +22,7 @@ _FOUND = ("bending_stiffness", "bending_damping")
 @pytest.fixture(scope="module")
 def cable():
     """A cable that swings for six seconds, there and back and there, seen without noise."""
-    windows = windows_of(cases.recording())
-    longer = {
-        name: np.concatenate([a, np.flip(a, axis=1), a], axis=1)
-        for name in ("keypoints", "position", "frames", "valid")
-        for a in [getattr(windows, name)]
-    }
-    windows = dataclasses.replace(windows, **longer)
+    windows = cases.swinging(3)
     cable = SpatialCable(Rod(16, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows)
     return cable.on(dataclasses.replace(windows, keypoints=cable.motion(_with(cable, 2.5, 0.03))))
 

@@ -88,8 +88,7 @@ def diagnose_space(
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
     stiffness = cable["bending_stiffness_n_m2"] / density
     progress(f"{len(windows)} windows of {longest:g} s, {len(np.unique(windows.group))} recordings")
-    changes = local_changes(log, windows.held)
-    for change in changes:
+    for change in (changes := local_changes(log, windows.held)):
         progress(change)
     noise = windows.noise
     found = identify(windows, stiffness, cable["bending_damping_s"], only=only, state=state, progress=progress)
@@ -99,9 +98,11 @@ def diagnose_space(
     lost, error, use = _simulated(after, windows)
     kept_windows = found.cable.chosen(use)
     compared, smallest, own = with_gap(kept_windows, before[use], noise)
+    cut = _seconds(compared.windows) if compared.windows.valid.sum() < kept_windows.windows.valid.sum() else None
     gap = gap_of(before[use], after[use], compared, noise, smallest)
     equivalent = _equivalent(found, named)
-    own_after = own_error(compared, found.everything.with_only(with_both_drags(named)), noise)
+    explaining = found.everything.with_only(with_both_drags(named))
+    own_after = own_error(compared, explaining, compared.motion(explaining), noise)
     verdict = _verdict(gap, 1e3 * smallest_gap(noise, windows, own_after), named, equivalent)
     share = gap.shrinkage
     if verdict == "unknown":  # each effect may be absent: by all of them together
@@ -110,7 +111,6 @@ def diagnose_space(
         effects = ()
     offset = ParameterEstimate(constant_offset(after[use], kept_windows.windows), None, "m")
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
-    where = where_of(log, kept_windows.windows, nominal, before[use], noise, smallest, changes)
     return SpatialDiagnosis(
         verdict=verdict,
         sentence=" ".join([verdict_sentence(verdict, effects, equivalent, share or 0.0), *changes[:1], *shifted]),
@@ -119,13 +119,13 @@ def diagnose_space(
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
         ranking=_ranking(found),
         gap=gap,
-        where=where,
+        where=where_of(log, kept_windows.windows, nominal, before[use], noise, smallest, changes),
         caveats=(
             *repairs,
             *resampled,
             *shifted,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(windows, left_out, found, _seconds(compared.windows), own, own_after),
+            *_caveats(windows, left_out, found, cut, own, own_after),
         ),
         log=log,
         nominal=nominal,
@@ -250,7 +250,7 @@ def _caveats(windows, left_out, found, compared_s, own, own_after) -> tuple[str,
             f"{np.sqrt((grips**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen "
             "are predicted with the mean."
         )
-    if compared_s < _seconds(windows):
+    if compared_s is not None:
         result.append(
             "The nominal cable amplifies the noise in the first two samples of each window until it moves as far from "
             f"itself as from the recording. The gap is therefore that of the first {compared_s:g} s of each window."

@@ -61,7 +61,7 @@ def with_gap(
     found = []
     for share in (1.0, *SHARES[::-1]):
         part = early(cable, share)
-        own = own_error(part, explanation(), noise)
+        own = own_error(part, explanation(), nominal, noise)
         found.append((part, smallest_gap(noise, cable.windows, own), own))
         if is_gap(nominal, part.windows, found[-1][1]):
             return found[-1]
@@ -75,7 +75,7 @@ def is_gap(nominal: Float[np.ndarray, "W T F 3"], windows: Windows, smallest: fl
     return bool(squared[seen].sum() > smallest**2 * seen.sum())
 
 
-def own_error(cable: SpatialCable, one: Explanation, noise: float) -> float:
+def own_error(cable: SpatialCable, one: Explanation, motion: Float[np.ndarray, "W T F 3"], noise: float) -> float:
     """The error of a coordinate that the simulation has by itself, root mean square [m].
 
     A window begins with the shape and the velocity that its first two samples show, and noise makes both wrong: by as
@@ -84,9 +84,9 @@ def own_error(cable: SpatialCable, one: Explanation, noise: float) -> float:
     Args:
         cable: with the edges of predictions.
         one: what is simulated; nothing for the nominal cable.
+        motion: what it simulates in the windows [m].
         noise: standard deviation of a coordinate [m].
     """
-    motion = cable.motion(one)
 
     def off(other: SpatialCable) -> float:
         apart = bounded(other.motion(one) - motion) ** 2
