@@ -6,8 +6,9 @@
     python experiments/34_fresh_cables.py --report docs/results/fresh_cables.md
 
 Every cable has each of five effects with a chance of one half. It is simulated by a rod that has more than is fitted
-(odd seeds) or by links on ball joints in MuJoCo (even seeds), seen through noise, and handed to the protocol of the
-real recordings: windows, search, fits to both halves of the recordings, estimates from each half and from all.
+(odd seeds) or by links on ball joints in MuJoCo (even seeds), seen through noise, with accidents, and handed to the
+protocol of the real recordings: repairs, windows, search, fits to both halves of the recordings, estimates from each
+half and from all.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ os.environ.setdefault("NPROC", "4")
 import numpy as np
 from scipy.stats import norm
 
-from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
+from cablejax.recordings.deform import SAMPLE_INTERVAL, repaired_blocks
 from cablejax.spatial.cable import errors
 from cablejax.spatial.identify import identify
 from cablejax.spatial.named import SURE, named_effects, quantities_of
@@ -35,7 +36,7 @@ from pages import markdown_table, page_of_results, publish, share
 from real_cables.benchmark import errors_of
 from real_cables.known import REPORTED, with_true_values
 from real_cables.protocol import protocol_windows
-from real_cables.synthetic import EFFECTS, RECORDINGS, SAMPLES, Law, synthetic_recordings
+from real_cables.synthetic import EFFECTS, LENGTH, STIFFNESS, Law, synthetic_recordings
 from rows import Rows, made_on
 
 HELD_OUT = range(1480, 1520)
@@ -43,6 +44,10 @@ HELD_OUT = range(1480, 1520)
 TRIALS = Path("docs") / "results" / "trials" / "fresh_cables.jsonl"
 LAWS: tuple[tuple[Law, str], ...] = (("richer", "the rod"), ("composite", "MuJoCo"))
 """The two simulators, and their names on the page."""
+SECONDS, DURATIONS = 16.0, (1.0, 2.0, 4.0)
+"""Length of all recordings of a cable together, and of each, which is one of these."""
+SHOWS = 1e-3
+"""Whether an effect that is there is named is judged where it moves the markers this far [m]."""
 LEVELS = (0.9, SURE)
 """Of the intervals that are reported, and of those by which an effect is named."""
 NEAR = 0.1
@@ -62,6 +67,11 @@ def law_of(seed: int) -> Law:
     return "richer" if seed % 2 else "composite"
 
 
+def duration_of(seed: int) -> float:
+    """Length of each of the cable's recordings [s]."""
+    return float(np.random.default_rng((seed, 5)).choice(DURATIONS))
+
+
 def present_in(seed: int) -> list[str]:
     """Which of `EFFECTS` the cable has."""
     chosen = np.random.default_rng((seed, 3)).random(len(EFFECTS)) < 0.5
@@ -75,14 +85,18 @@ def named_in(effects: list[str]) -> set[str]:
 
 def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
     """One cable through the protocol of the real recordings."""
-    begun, present = time.perf_counter(), present_in(seed)
+    duration, present = duration_of(seed), present_in(seed)
+    count, samples = round(SECONDS / duration), round(duration / SAMPLE_INTERVAL)
     try:
-        cable, recordings = synthetic_recordings(seed, law_of(seed), present=present)
+        made = synthetic_recordings(seed, law_of(seed), count, samples, present=present)
+        moved = {effect: 1e3 * made.moved_by(effect) for effect in present}
     except FloatingPointError as broken:
         return {"broken": str(broken)}
+    cable, begun = made.cable, time.perf_counter()
+    recordings, repairs = repaired_blocks(made.recordings)
     windows = protocol_windows(recordings)
     state = None if cache is None else cache / f"{seed}.json"
-    found = identify(windows, NOMINAL.stiffness_over_density, state=state)
+    found = identify(windows, cable.believed, state=state)
     everything = found.everything
     effects = [effect.name for effect in named_effects(found, density=1.0)]
     judged = [name for name in effects if name in REPORTED and name in (*present, *UNJUDGED)]
@@ -102,7 +116,12 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
     unseen = errors_of(predicted, windows)
     return {
         "law": law_of(seed),
+        "duration": duration,
+        "length_m": cable.length,
+        "stiffness_over_density_m4_per_s2": truth[EI],
         "present": present,
+        "moved_mm": moved,
+        "repairs": len(repairs),
         "effects": effects,
         "reported": reported,
         # of all effects, there or not, named or not, without `UNMODELLED`
@@ -155,17 +174,34 @@ def calibration(rows: list[dict[str, Any]]) -> list[str]:
 
 def named_table(rows: list[dict[str, Any]]) -> list[str]:
     """Effects that are there and named, and that are named though they are not there."""
-    table = [["effect", "named where it is there", "share", "named though it is not there", "share"]]
-    every: tuple[list[bool], list[bool]] = [], []
+    table = [["effect", "named where it shows", "share", "named where it is hidden", "named though not there", "share"]]
+    every: dict[str, list[bool]] = {"shows": [], "hidden": [], "not there": []}
     for effect in EFFECTS:
-        named = {True: [], False: []}
+        named = {how: [] for how in every}
         for row in rows:
-            named[effect in row["present"]].append(effect in named_in(row["effects"]))
-        table.append([effect, *share(named[True]), *share(named[False])])
-        every[0].extend(named[True])
-        every[1].extend(named[False])
-    table.append(["all", *share(every[0]), *share(every[1])])
+            named[presence(row, effect)].append(effect in named_in(row["effects"]))
+        table.append([effect, *_shares(named)])
+        for how, of in named.items():
+            every[how].extend(of)
+    table.append(["all", *_shares(every)])
     return markdown_table(table)
+
+
+def presence(row: dict[str, Any], effect: str) -> str:
+    """Whether an effect is there, and moves the markers far enough to be judged."""
+    if effect not in row["present"]:
+        return "not there"
+    return "shows" if row["moved_mm"][effect] >= 1e3 * SHOWS else "hidden"
+
+
+def missed_in(row: dict[str, Any]) -> list[str]:
+    """Effects that show and are not named."""
+    return [e for e in EFFECTS if presence(row, e) == "shows" and e not in named_in(row["effects"])]
+
+
+def _shares(named: dict[str, list[bool]]) -> list[str]:
+    hidden = named["hidden"]
+    return [*share(named["shows"]), f"{sum(hidden)} of {len(hidden)}", *share(named["not there"])]
 
 
 def interval_table(rows: list[dict[str, Any]]) -> list[str]:
@@ -196,17 +232,22 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
     lines = [
         f"{len(rows)} of the {len(HELD_OUT)} cables of seeds {HELD_OUT[0]} to {HELD_OUT[-1]} ({broken} left out, "
         f"because their recordings could not be simulated, {len(HELD_OUT) - broken - len(rows)} not done), "
-        f"each with {RECORDINGS} recordings of {SAMPLES * SAMPLE_INTERVAL:g} s at {1 / SAMPLE_INTERVAL:g} Hz, through "
-        "the protocol of the [real recordings](real_cables.md). Odd seeds are simulated by a rod with twice the edges "
-        "of the fitted one, and with a rest curvature, markers off the centreline and grippers that roll, which are "
-        "not tried; even seeds by links on ball joints in MuJoCo, which share no code with the fit. Each effect is "
-        "there with a chance of one half: EI/rho off the nominal value by a factor of 1.3 or more, damping of 0.01 to "
-        "0.1 s, drag of 0.2 to 0.8 1/s at the grippers' speed, split at random between both laws, EI somewhere off its "
-        "mean by about 30 % or more, grips turned with a standard deviation of 0.2 rad in all recordings and 0.2 rad "
-        "more in each. Naming no effect would find none in the first column, and be right in all cases of the second. "
-        "Either law of drag counts for both. The markers' mass and places are not judged: motion hardly separates the "
-        "markers' mass from the cable's own, and their places are read off the recording with errors of some "
-        "millimetres.",
+        f"of {LENGTH[0]:g} to {LENGTH[1]:g} m and EI/rho of {STIFFNESS[0]:g} to {STIFFNESS[1]:g} m^4/s^2, each with "
+        f"{SECONDS:g} s of recordings of {', '.join(f'{d:g}' for d in DURATIONS)} s at {1 / SAMPLE_INTERVAL:g} Hz, "
+        "through the repairs and the protocol of the [real recordings](real_cables.md). Odd seeds are simulated by a "
+        "rod with twice the edges of the fitted one, and with a rest curvature, markers off the centreline and "
+        "grippers that roll, which are not tried; even seeds by links on ball joints in MuJoCo, which share no code "
+        "with the fit. In a fifth of the recordings a gripper is struck, in a fifth a marker is not seen for a while, "
+        "in a fifth another point is taken for one. Each effect is there with a chance of one half: EI/rho off the "
+        "value that is believed by a factor of 1.3 or more, damping of 0.01 to 0.3 s, drag of 0.2 to 0.8 1/s at the "
+        "grippers' speed, split at random between both laws, EI somewhere off its mean by about 30 % or more, grips "
+        "turned with a standard deviation of 0.2 rad in all recordings and 0.2 rad more in each. An effect shows "
+        f"where the markers of the cable without it would be elsewhere, by {1e3 * SHOWS:g} mm or more (median over "
+        "samples and markers); where it is hidden, motion does not show it, as the bending of a long, soft cable that "
+        "hangs like a chain. Naming no effect would find none in the first column, and be right in all cases of the "
+        "last. Either law of drag counts for both. The markers' mass and places are not judged: motion hardly "
+        "separates the markers' mass from the cable's own, and their places are read off the recording with errors of "
+        "some millimetres.",
         "",
         *named_table(rows),
         "",
@@ -239,11 +280,16 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
         "",
         *markdown_table(
             [
-                ["seed", "missed", "named though not there", "halves differ by", "error [mm]"],
+                [
+                    *("seed", "length [m]", "EI/rho [m^4/s^2]", "missed", "named though not there"),
+                    *("halves differ by", "error [mm]"),
+                ],
                 *(
                     [
                         str(row["seed"]),
-                        ", ".join(sorted({*row["present"]} - named_in(row["effects"]))),
+                        f"{row['length_m']:.2f}",
+                        f"{row['stiffness_over_density_m4_per_s2']:.4f}",
+                        ", ".join(sorted(missed_in(row))),
                         ", ".join(sorted(named_in(row["effects"]) - {*row["present"]})),
                         f"{100 * r:.0f} %",
                         "{:.1f} to {:.1f}".format(*row["error_mm"]),

@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import math
 import os
 import pathlib
 from collections.abc import Sequence
@@ -76,10 +77,11 @@ def information(cable: SpatialCable, found: Estimate) -> Float[np.ndarray, "W"]:
 
 def trial(data: str | None, name: str, seed: int) -> dict[str, Any]:
     """One cable from three windows, and with each candidate as the fourth."""
-    rng, truth = np.random.default_rng([SEED, seed]), None
+    rng, believed, truth = np.random.default_rng([SEED, seed]), NOMINAL.stiffness_over_density, None
     if name == SYNTHETIC:
-        made, recordings = synthetic_recordings(FIRST_CABLE + seed, "richer" if seed % 2 else "composite", 24)
-        truth, windows = float(np.log(made.stiffness / made.laden)), protocol_windows(recordings)
+        made = synthetic_recordings(FIRST_CABLE + seed, "richer" if seed % 2 else "composite", 24, 100)
+        cable, (recordings, _) = made.cable, repaired_blocks(made.recordings)
+        believed, truth, windows = cable.believed, math.log(cable.stiffness / cable.laden), protocol_windows(recordings)
         windows = dataclasses.replace(windows, split=("train",) * 16 + ("eval",) * (len(windows) - 16))
     else:
         assert data is not None
@@ -88,7 +90,7 @@ def trial(data: str | None, name: str, seed: int) -> dict[str, Any]:
     is_eval, whole = np.array(windows.split) == "eval", windows.whole(len(windows))
     drawn = rng.permutation(whole[~is_eval[whole]])[: FIRST + CANDIDATES]
     first, candidates = drawn[:FIRST], drawn[FIRST:]
-    found = identify(windows.chosen(first), NOMINAL.stiffness_over_density)
+    found = identify(windows.chosen(first), believed)
     known, checked = found.everything, found.cable.on(windows.chosen(np.flatnonzero(is_eval)))
     fitted = dataclasses.replace(found.cable, rod=Rod(EDGES, 1, twisting=False)).finer(found.time_steps.substeps)
     gain = information(fitted.on(windows.chosen(candidates)), known)

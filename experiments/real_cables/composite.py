@@ -6,6 +6,7 @@ torsion, drag acts on the middle of every link, and both ends are welded to grip
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -19,14 +20,20 @@ if TYPE_CHECKING:
 
 EDGES = 32
 """Links of the cable's length: one more, for half a link at each end is in a gripper."""
-_STEPS = (5e-4, 2.5e-4)
-"""Time step [s], and a shorter one where that breaks down: springs are explicit in MuJoCo."""
+_STEP = 5e-4
+"""Longest time step [s]."""
+_STABLE = 1.2
+"""And as a phase of the fastest vibration [rad], for springs are explicit in MuJoCo."""
+_SHORTER = 1, 4, 16
+"""It is divided by these in turn where a recording breaks down."""
 _DENSITY = 0.05
 """Mass per length [kg/m]; a hanging cable's motion does not depend on it."""
-_RADIUS = 0.008
-"""Of the links [m]: thinner ones turn about themselves faster than the time step can follow."""
-_JUMP = 0.1
-"""No hand moves a marker so far from one sample to the next [m]."""
+_RADIUS = 0.28
+"""Of the links, over their length: thinner ones turn about themselves faster than the time step can follow."""
+_JUMP = 0.2
+"""No motion moves a marker so far from one sample to the next, over the cable's length."""
+_DAMPED = 200.0
+"""Damping time over that of the fastest vibration, at most: grips are welds, and give way where dampers are stiffer."""
 _SETTLE, _SETTLE_DRAG = 1.0, 8.0
 """Time before the grippers move in which the cable comes to rest [s], and the drag that brings it there [1/s]."""
 _WELD = "0.0015 1"
@@ -54,19 +61,32 @@ def simulated(
         interval: between samples [s].
     """
     model = mujoco.MjModel.from_xml_string(_xml(cable, arclength))
-    every = [_ends(*motion) for motion in zip(position, frames, cable.grips, strict=True)]
-    found = np.zeros(0)
-    for step in _STEPS:
-        model.opt.timestep = step
-        found = np.stack([_recording(model, cable, arclength, ends, interval) for ends in every])
-        if not broken(found):
-            break
-    return found
+    step, found = min(_STEP, _STABLE / _fastest(cable)), []
+    for motion in zip(position, frames, cable.grips, strict=True):
+        ends, seen = _ends(*motion), np.zeros(0)
+        for shorter in _SHORTER:
+            # samples are whole numbers of steps
+            model.opt.timestep = interval / (shorter * math.ceil(interval / step))
+            seen = _recording(model, cable, arclength, ends, interval)
+            if not broken(seen, cable.length):
+                break
+        found.append(seen)
+    return np.stack(found)
 
 
-def broken(markers: Float[np.ndarray, "R T N 3"]) -> bool:
-    """Whether a simulation broke down: MuJoCo begins anew where it becomes unstable."""
-    return not np.isfinite(markers).all() or np.abs(np.diff(markers, axis=1)).max() > _JUMP
+def broken(markers: Float[np.ndarray, "*R T N 3"], length: float) -> bool:
+    """Whether the simulation of a cable of this length [m] broke down: MuJoCo begins anew where it becomes unstable."""
+    return not np.isfinite(markers).all() or np.abs(np.diff(markers, axis=-3)).max() > _JUMP * length
+
+
+def longest_damping(cable: SyntheticCable) -> float:
+    """The damping time up to which links can be simulated [s]: about half of what is critical for the first mode."""
+    return _DAMPED / _fastest(cable)
+
+
+def _fastest(cable: SyntheticCable) -> float:
+    """Angular frequency of the links' fastest vibration [1/s]."""
+    return float(4 * np.sqrt(cable.stiffness * np.exp(cable.profile.max())) * (EDGES / cable.length) ** 2)
 
 
 def _recording(model, cable, arclength, ends: list[Ends], interval: float) -> Float[np.ndarray, "T N 3"]:
@@ -122,7 +142,7 @@ def _xml(cable, arclength) -> str:
         )
         text.append(
             f'<body name="link{k}" pos="{edge if k else 0} 0 0">{joint}'
-            f'<geom type="capsule" fromto="0 0 0 {edge} 0 0" size="{_RADIUS}" mass="{_DENSITY * edge}"/>'
+            f'<geom type="capsule" fromto="0 0 0 {edge} 0 0" size="{_RADIUS * edge}" mass="{_DENSITY * edge}"/>'
         )
         if k in markers and cable.marker_mass > 0:
             mass = _DENSITY * cable.marker_mass
@@ -165,6 +185,21 @@ def _between(one, other, part):
     sign = np.where(one[1] @ other[1] < 0, -1.0, 1.0)
     turn = (1 - part) * one[1] + part * sign * other[1]
     return (1 - part) * one[0] + part * other[0], turn / np.linalg.norm(turn)
+
+
+def hanging(
+    length: float, position: Float[np.ndarray, "2 3"], arclength: Float[np.ndarray, "N"]
+) -> Float[np.ndarray, "N 3"]:
+    """A guess of where markers are that hang between two places at about the same height [m]."""
+    bend = _bend_between(length, [(position[q], np.zeros(4)) for q in range(2)])
+    way = position[1] - position[0]
+    across = np.append(way[:2] / np.linalg.norm(way[:2]), 0.0)
+    steps = np.cos(bend)[:, None] * across + np.sin(bend)[:, None] * np.array([0.0, 0.0, 1.0])
+    middle = 0.5 * (steps[1:] + steps[:-1])
+    nodes = np.concatenate([np.zeros((1, 3)), np.cumsum(middle, axis=0) * length / EDGES])
+    nodes = position[0] + nodes + np.linspace(0, 1, EDGES + 1)[:, None] * (way - nodes[-1])
+    s = np.linspace(0, length, EDGES + 1)
+    return np.stack([np.interp(arclength, s, column) for column in nodes.T], axis=1)
 
 
 def _bend_between(length: float, ends: Ends) -> Float[np.ndarray, "K"]:

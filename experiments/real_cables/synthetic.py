@@ -1,8 +1,10 @@
 """Synthetic recordings of a cable in space whose parameters are known, for checks of the estimates.
 
-Cables are drawn at random from wider ranges than the real ones span. The true cable is a rod with twice the edges of
-the one that is fitted, and with eight time steps a sample, of which the search makes one where that is fine enough, and
-the estimate four. Markers have a slow error and one that is new at every sample.
+Cables are drawn at random from far wider ranges than the real ones span: 0.3 to 3 m, EI / rho of 0.0003 to 0.3 m^4/s^2.
+The true cable is a rod with twice the edges of the one that is fitted, and with eight time steps a sample, of which the
+search makes one where that is fine enough, and the estimate four. Markers have a slow error and one that is new at
+every sample. In some recordings a gripper is struck, a marker is not seen for a while, or another point is taken for
+it.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL, DeformRecordings
+from cablejax.recordings.deform import SAMPLE_INTERVAL, DeformRecordings
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.rod import Rod, RodPhysics
 from cablejax.simulate.rod.clamps import frames_along
@@ -26,9 +28,11 @@ from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS, TWIST_RATIO
 from cablejax.spatial.identify import EDGES
 from real_cables import composite
 
-RECORDINGS, SAMPLES, MARKERS = 16, 100, 6
-SPEED = 0.6
-"""Of the grippers, root mean square [m/s]."""
+STIFFNESS, LENGTH = (0.0003, 0.3), (0.3, 3.0)
+"""Ranges of EI / rho, markers included [m^4/s^2], and of the length between the clamps [m]."""
+MARKERS = 6, 9
+"""Free ones: one of these numbers."""
+_TRUE, _QUICK = Rod(2 * EDGES, 8), Rod(EDGES, 2)
 # The cable swings in before the recording begins, so that it does not start at rest or at a guess.
 _LEAD = 80
 _REACH = 0.028  # from a gripper's outer to its inner marker [m]
@@ -37,6 +41,13 @@ _DISTINCT, _SOFTER = 1.3, 0.3  # least ratio of stiffness to the believed one, c
 _UNDAMPED = 1e-3  # no cable is without any damping, and this does not show [s]
 _DRAG = 0.2, 0.8  # range of both drags together at the grippers' speed [1/s]
 _UNEVEN = 0.3  # least difference of the stiffness somewhere from its mean along the cable
+_RATES = 0.3, 1.5  # of the grippers' vibrations [Hz]
+_SPEED = 0.3, 1.2  # of the grippers, root mean square [m/s]
+_LIVELY = 0.65  # and over the cable's length, at most [1/s]
+_STRUCK, _STROKE = 0.08, (30.0, 300.0)  # a stroke to a gripper: its time [s], the largest acceleration [m/s^2]
+_SHORT_STROKE = 0.05  # as a share of the length it moves the gripper no further
+_CHANCE = 0.2  # of a stroke, a gap and a wrong point in each recording
+_GAP, _WRONG = (0.05, 0.3), (0.03, 0.1)  # how long a marker is not seen [s], how far the wrong point is [m]
 
 Law = Literal["as fitted", "richer", "composite"]
 """Whether the true cable obeys the simulator that is fitted, or has a rest curvature, markers off its centreline and
@@ -47,10 +58,11 @@ EFFECTS = ("bending_stiffness", "bending_damping", "drag", "stiffness_profile", 
 
 @dataclasses.dataclass(frozen=True)
 class SyntheticCable:
-    """What is true of a cable and of how it is held and seen.
+    """What is true of a cable and of how it is held, moved and seen.
 
     Attributes:
-        stiffness: EI / rho, geometric mean over the knots of the profile [m^4/s^2].
+        believed: EI / rho that its user takes it to have, rho with the markers [m^4/s^2].
+        stiffness: EI / rho of the bare cable, geometric mean over the knots of the profile [m^4/s^2].
         profile: logarithm of EI / rho over that mean, at evenly spaced knots along the cable, shape [K].
         length: between the clamps [m].
         damping_time: Kelvin-Voigt time constant of bending [s].
@@ -62,8 +74,11 @@ class SyntheticCable:
         rest_curvature: at evenly spaced knots, about the material's second and third axis [1/m], shape [C, 2].
         offset: of the free markers from the centreline [m], shape [N, 2].
         roll: of the grippers about the cable, root mean square [rad].
+        span: mean distance of the grippers over the length.
+        speed: of the grippers, root mean square [m/s].
     """
 
+    believed: float
     stiffness: float
     profile: Float[np.ndarray, "K"]
     length: float
@@ -76,22 +91,72 @@ class SyntheticCable:
     rest_curvature: Float[np.ndarray, "C 2"]
     offset: Float[np.ndarray, "N 2"]
     roll: float
+    span: float
+    speed: float
 
     @property
     def laden(self) -> float:
         """Mass of the cable with its markers over that of the bare one, see `effects.Layout.laden`."""
         return 1.0 + self.marker_mass * (len(self.offset) + 1) / self.length
 
+    def without(self, effect: str) -> SyntheticCable:
+        """The cable without one of `EFFECTS`.
+
+        Without `bending_stiffness` EI / rho is what is believed; without `bending_damping` it is damped so little that
+        this does not show.
+        """
+        match effect:
+            case "bending_stiffness":
+                return dataclasses.replace(self, stiffness=self.laden * self.believed)
+            case "bending_damping":
+                return dataclasses.replace(self, damping_time=_UNDAMPED)
+            case "drag":
+                return dataclasses.replace(self, drag=0.0, quadratic_drag=0.0)
+            case "stiffness_profile":
+                return dataclasses.replace(self, profile=np.zeros_like(self.profile))
+            case "gripper_rotation_offset":
+                return dataclasses.replace(self, grips=np.zeros_like(self.grips))
+        raise ValueError(f"The effect is {effect!r}, expected one of {', '.join(EFFECTS)}.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Synthetic:
+    """A cable, and what motion capture saw of it.
+
+    Attributes:
+        cable: the true one.
+        recordings: of it, with accidents as they come: nothing in them is repaired.
+        arclength: of the free markers from the first gripper [m].
+        position, frames: of the grippers, from before the recording on.
+    """
+
+    cable: SyntheticCable
+    recordings: DeformRecordings
+    arclength: Float[np.ndarray, "N"]
+    position: Float[np.ndarray, "R S 2 3"]
+    frames: Float[np.ndarray, "R S 2 3 3"]
+
+    def moved_by(self, effect: str) -> float:
+        """How far one of `EFFECTS` moves the markers by the law that is fitted: median over samples and markers [m]."""
+        plain = dataclasses.replace(self.cable, rest_curvature=np.zeros((CURVATURE_KNOTS, 2)))
+        plain = dataclasses.replace(plain, offset=np.zeros_like(plain.offset))
+        has, lacks = (
+            _simulated(cable, self.arclength, self.position, self.frames, _QUICK)
+            for cable in (plain, plain.without(effect))
+        )
+        return float(np.nanmedian(np.linalg.norm(has - lacks, axis=-1)))
+
 
 def synthetic_recordings(
-    seed: int, law: Law, recordings: int = RECORDINGS, *, present: Sequence[str] | None = None
-) -> tuple[SyntheticCable, DeformRecordings]:
-    """A cable and what motion capture saw of it, in so many recordings of `SAMPLES` samples.
+    seed: int, law: Law, recordings: int, samples: int, *, present: Sequence[str] | None = None
+) -> Synthetic:
+    """A cable and what motion capture saw of it, in so many recordings of so many samples.
 
     Args:
         seed: of all draws.
         law: that the cable obeys.
         recordings: how many.
+        samples: of each.
         present: which of `EFFECTS` it has, see `with_effects`; None = all, of any size.
 
     Raises:
@@ -101,31 +166,38 @@ def synthetic_recordings(
     cable = drawn_cable(generator, recordings)
     if present is not None:
         cable = with_effects(cable, present, np.random.default_rng((seed, 2)))
+    count = len(cable.offset)
     if law == "richer":
         cable = dataclasses.replace(
             cable,
             rest_curvature=0.5 * more.normal(size=(CURVATURE_KNOTS, 2)),
-            offset=0.002 * more.normal(size=(MARKERS, 2)),
+            offset=0.002 * more.normal(size=(count, 2)),
             roll=0.15,
         )
-    position, direction = _motion(generator, recordings)
-    roll = cable.roll * _vibrations(more, (recordings, 1, 2))
-    s = np.linspace(0, cable.length, MARKERS + 2)[1:-1] + 0.003 * generator.normal(size=MARKERS)
+    if law == "composite":
+        damping = min(cable.damping_time, composite.longest_damping(cable))
+        cable = dataclasses.replace(cable, damping_time=damping)
+    position, direction = _motion(cable, generator, recordings, samples)
+    roll = cable.roll * _vibrations(more, (recordings, 1, 2), samples)
+    spread = 0.003 * min(1.0, cable.length)
+    s = np.linspace(0, cable.length, count + 2)[1:-1] + spread * generator.normal(size=count)
     frames = _rolled(direction, roll)
     if law == "composite":
         free = composite.simulated(cable, s, position, frames, SAMPLE_INTERVAL)[:, _LEAD:]
     else:
         free = _simulated(cable, s, position, frames)
-    if composite.broken(free):
+    if composite.broken(free, cable.length):
         raise FloatingPointError(f"The simulation of cable {seed} ({law}) broke down.")
     outer = position + np.array([-1.0, 1.0])[:, None] * _REACH * direction
     ends = [part[:, _LEAD:] for part in (outer[:, :, :1], position[:, :, :1], position[:, :, 1:], outer[:, :, 1:])]
     points = np.concatenate([*ends[:2], free, *ends[2:]], axis=2)
     points = points + _slow_error(generator, points.shape)
     points = points + cable.noise * generator.normal(size=points.shape)
+    points = _misread(points, np.random.default_rng((seed, 4)))
     names = np.arange(recordings)
     split = np.full(recordings, "train")
-    return cable, DeformRecordings(points, SAMPLE_INTERVAL, split, names, names, f"seed {seed}, {law}")
+    seen = DeformRecordings(points, SAMPLE_INTERVAL, split, names, names, f"seed {seed}, {law}")
+    return Synthetic(cable, seen, s, position, frames)
 
 
 def drawn_cable(generator: np.random.Generator, recordings: int) -> SyntheticCable:
@@ -134,65 +206,101 @@ def drawn_cable(generator: np.random.Generator, recordings: int) -> SyntheticCab
     def between(low, high):
         return float(np.exp(generator.uniform(np.log(low), np.log(high))))
 
+    markers, length, stiffness = int(generator.choice(MARKERS)), between(*LENGTH), between(*STIFFNESS)
+    ratio = between(_DISTINCT, 10.0)
+    if generator.random() < _SOFTER:
+        ratio = 1 / between(_DISTINCT, 2.0)
     profile = 0.25 * generator.normal(size=PROFILE_KNOTS)
-    return SyntheticCable(
-        stiffness=between(0.01, 0.2),
+    cable = SyntheticCable(
+        believed=stiffness / ratio,
+        stiffness=stiffness,
         profile=profile - profile.mean(),
-        length=float(generator.uniform(0.85, 1.0)),
-        damping_time=between(0.01, 0.1),
+        length=length,
+        damping_time=between(0.01, 0.3),
         drag=float(generator.uniform(0.0, 0.8)),
         quadratic_drag=float(generator.uniform(0.0, 0.3)),
-        marker_mass=between(0.002, 0.04),
+        marker_mass=between(0.002, min(0.04, 0.04 * length)),
         grips=0.2 * generator.normal(size=(2, 2)) + 0.2 * generator.normal(size=(recordings, 2, 2)),
         noise=between(3e-5, 3e-4),
         rest_curvature=np.zeros((CURVATURE_KNOTS, 2)),
-        offset=np.zeros((MARKERS, 2)),
+        offset=np.zeros((markers, 2)),
         roll=0.0,
+        span=float(generator.uniform(0.35, 0.6)),
+        speed=min(between(*_SPEED), _LIVELY * length),
     )
+    return dataclasses.replace(cable, stiffness=cable.laden * cable.stiffness)
 
 
 def with_effects(cable: SyntheticCable, present: Sequence[str], generator: np.random.Generator) -> SyntheticCable:
-    """The cable with some of `EFFECTS`, all but the grips large enough to show, and none of the others.
-
-    Without `bending_stiffness` EI / rho is what is believed, rho with the markers.
-    """
-    ratio = np.exp(generator.uniform(np.log(_DISTINCT), np.log(10.0)))
-    if generator.random() < _SOFTER:
-        ratio = 1 / np.exp(generator.uniform(np.log(_DISTINCT), np.log(2.0)))
+    """The cable with some of `EFFECTS`, of no negligible size, and none of the others."""
     linear, quadratic = generator.dirichlet([1.0, 1.0]) * generator.uniform(*_DRAG)
     uneven = np.abs(np.expm1(cable.profile)).max()
-    has = {effect: effect in present for effect in EFFECTS}
-    return dataclasses.replace(
+    cable = dataclasses.replace(
         cable,
-        stiffness=cable.laden * NOMINAL.stiffness_over_density * (ratio if has["bending_stiffness"] else 1.0),
-        damping_time=cable.damping_time if has["bending_damping"] else _UNDAMPED,
-        drag=linear * has["drag"],
-        quadratic_drag=quadratic / SPEED * has["drag"],
-        profile=cable.profile * max(1.0, _UNEVEN / uneven) * has["stiffness_profile"],
-        grips=cable.grips * has["gripper_rotation_offset"],
+        drag=linear,
+        quadratic_drag=quadratic / cable.speed,
+        profile=cable.profile * max(1.0, _UNEVEN / uneven),
     )
+    if "bending_stiffness" not in present:  # what is believed is true then
+        cable = dataclasses.replace(cable, believed=cable.stiffness / cable.laden)
+    for effect in EFFECTS:
+        cable = cable if effect in present else cable.without(effect)
+    return cable
 
 
-def _motion(generator: np.random.Generator, recordings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Fast motion of both grippers: positions [R, T, 2, 3] and directions along the cable [R, T, 2, 3].
+def _motion(
+    cable: SyntheticCable, generator: np.random.Generator, recordings: int, samples: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motion of both grippers: positions [R, S, 2, 3] and directions along the cable [R, S, 2, 3].
 
-    Vibrations with 6 cm root mean square make 0.6 m/s. The cable leaves one gripper downwards and comes up to the
-    other, both turned by 0.2 rad.
+    The cable leaves one gripper downwards and comes up to the other, both turned by 0.2 rad. In some recordings one of
+    them is struck: it moves aside and back.
     """
     shape = (recordings, 1, 2, 3)
-    rates = [generator.uniform(low, high, (*shape, 3)) for low, high in [(0.3, 1.5), (0, 2 * np.pi)] * 2]
-    position = np.array([[0.0, 0.0, 0.6], [0.5, 0.0, 0.6]]) + 0.06 * _sum_of_waves(*rates[:2])
-    direction = np.array([[0.1, 0.0, -1.0], [0.1, 0.0, 1.0]]) + 0.15 * _sum_of_waves(*rates[2:])
+    moved, turned = (_vibrations(generator, shape, samples) for _ in range(2))
+    # the root mean square of three coordinates' speeds, each of its amplitude times 2 pi times the rate's
+    square = (_RATES[1] ** 3 - _RATES[0] ** 3) / (3 * (_RATES[1] - _RATES[0]))
+    amplitude = cable.speed / (2 * np.pi * math.sqrt(3 * square))
+    position = amplitude * moved
+    position = position + cable.span * cable.length * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    direction = np.array([[0.1, 0.0, -1.0], [0.1, 0.0, 1.0]]) + 0.15 * turned
+    for recording in np.flatnonzero(generator.random(recordings) < _CHANCE):
+        _strike(position[recording], cable.length, generator)
     return position, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
 
-def _vibrations(generator: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Root mean square 1; the second axis of the shape becomes time."""
-    return _sum_of_waves(generator.uniform(0.3, 1.5, (*shape, 3)), generator.uniform(0, 2 * np.pi, (*shape, 3)))
+def _strike(motion: Float[np.ndarray, "S 2 3"], length: float, generator: np.random.Generator) -> None:
+    """Moves one gripper aside and back, within the recording."""
+    lasts = round(_STRUCK / SAMPLE_INTERVAL)
+    begin = generator.integers(_LEAD + 5, len(motion) - lasts - 5)
+    way = generator.normal(size=3)
+    acceleration = np.exp(generator.uniform(*np.log(_STROKE)))
+    far = min(2 * acceleration * (_STRUCK / (2 * np.pi)) ** 2, _SHORT_STROKE * length)
+    bump = 0.5 * far * (1 - np.cos(2 * np.pi * np.arange(lasts) / lasts))
+    motion[begin : begin + lasts, generator.integers(2)] += bump[:, None] * way / np.linalg.norm(way)
 
 
-def _sum_of_waves(rate, phase):
-    time = SAMPLE_INTERVAL * np.arange(-_LEAD, SAMPLES).reshape(-1, *(1,) * (rate.ndim - 2))
+def _misread(points: Float[np.ndarray, "R T M 3"], generator: np.random.Generator) -> Float[np.ndarray, "R T M 3"]:
+    """What the cameras make of it: a free marker that is not seen for a while, or another point in place of one."""
+    points = points.copy()
+    for recording in points:
+        gap, wrong = generator.random(2) < _CHANCE
+        one, other = generator.integers(2, points.shape[2] - 2, 2)
+        if gap:
+            lasts = round(generator.uniform(*_GAP) / SAMPLE_INTERVAL)
+            begin = generator.integers(2, len(recording) - lasts)
+            recording[begin : begin + lasts, one] = np.nan
+        if wrong:
+            begin, way = generator.integers(2, len(recording) - 3), generator.normal(size=3)
+            far = generator.uniform(*_WRONG) / np.linalg.norm(way)
+            recording[begin : begin + generator.integers(1, 4), other] += far * way
+    return points
+
+
+def _vibrations(generator: np.random.Generator, shape: tuple[int, ...], samples: int) -> np.ndarray:
+    """Sums of three waves, root mean square 1; the second axis of the shape becomes time."""
+    rate, phase = generator.uniform(*_RATES, (*shape, 3)), generator.uniform(0, 2 * np.pi, (*shape, 3))
+    time = SAMPLE_INTERVAL * np.arange(-_LEAD, samples).reshape(-1, *(1,) * (rate.ndim - 2))
     return math.sqrt(2 / 3) * np.sin(2 * np.pi * rate * time + phase).sum(axis=-1)
 
 
@@ -204,10 +312,9 @@ def _rolled(direction, roll):
     return np.stack([along, cosine * second + sine * third, cosine * third - sine * second], axis=-2)
 
 
-def _simulated(cable: SyntheticCable, s, position, frames) -> Float[np.ndarray, "R T N 3"]:
-    """Free markers, from the beginning of the recordings on."""
-    line = (s / cable.length)[:, None]
-    sag = np.concatenate([0.5 * line, 0 * line, 0.6 - 0.35 * np.sin(np.pi * line)], axis=1)
+def _simulated(cable: SyntheticCable, s, position, frames, rod: Rod = _TRUE) -> Float[np.ndarray, "R T N 3"]:
+    """Free markers, from the beginning of the recordings on; NaN from where on no time step was solved."""
+    guess = np.stack([composite.hanging(cable.length, motion[0], s) for motion in position])
     values: dict[str, Any] = {
         "length": cable.length, "stiffness": cable.stiffness * np.exp(cable.profile),
         "rest_curvature": cable.rest_curvature, "damping_time": cable.damping_time, "drag": cable.drag,
@@ -216,19 +323,20 @@ def _simulated(cable: SyntheticCable, s, position, frames) -> Float[np.ndarray, 
     }  # fmt: skip
     arrays: dict[str, Any] = {n: np.repeat(np.asarray(v, float)[None], len(position), 0) for n, v in values.items()}
     physics = RodPhysics(**arrays, clamp_rotation=cable.grips)  # pyright: ignore[reportArgumentType]
-    twisting = bool(cable.rest_curvature.any() or cable.offset.any())
+    rod = dataclasses.replace(rod, twisting=bool(cable.rest_curvature.any() or cable.offset.any()))
     with jax.enable_x64(True):
-        return np.asarray(_program(twisting)(physics, position, frames, np.stack([sag, sag])))[:, _LEAD:]
+        points, solved = map(np.asarray, _program(rod)(physics, position, frames, np.stack([guess, guess], axis=1)))
+    reached = np.arange(points.shape[1]) < solved[:, None]
+    return np.where(reached[:, :, None, None], points, np.nan)[:, _LEAD:]
 
 
 @functools.cache
-def _program(twisting: bool):
-    rod = Rod(2 * EDGES, 8, twisting=twisting)
-
+def _program(rod: Rod):
     def one(physics, position, frames, seen):
-        return rod.rollout(physics, position, frames, seen, jnp.asarray(SAMPLE_INTERVAL)).points
+        found = rod.rollout(physics, position, frames, seen, jnp.asarray(SAMPLE_INTERVAL))
+        return found.points, found.solved
 
-    return jax.jit(jax.vmap(one, (0, 0, 0, None)), compiler_options=compiler_options())
+    return jax.jit(jax.vmap(one), compiler_options=compiler_options())
 
 
 def _slow_error(generator: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
