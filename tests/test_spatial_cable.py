@@ -14,7 +14,7 @@ from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
-from cablejax.spatial.estimate import Estimate, estimate_at, jackknife, starts_from
+from cablejax.spatial.estimate import Estimate, estimate_at, jackknife, resolution, starts_from
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.memory import Memory
 from cablejax.spatial.search import Step
@@ -174,8 +174,29 @@ def test_grips_of_every_recording_are_found_and_leave_the_stiffness_alone(cable)
     assert np.abs(held[0] - held[1]).max() < 0.1 and np.abs(held[1]).max() > 0.3
     moves = jackknife(evidence, fits[True])
     assert moves.shape == (4, 6) and 0 < np.sqrt((moves[:, 0] ** 2).sum()) < 0.2
-    told = estimate_at(evidence, fits[True]).stiffness
-    assert told.low < cases.NOMINAL * np.exp(0.7) < told.high
+
+
+def test_what_finer_edges_would_do_is_part_of_an_interval(cable):
+    true = at(cable).moved(np.array([0.7, 0.0, 0.0, 0.0, 0.0, 0.0]), np.zeros((4, 4)))
+    seen = cable.on(dataclasses.replace(cable.windows, keypoints=cable.exact().motion(true)))
+    corrected = seen.corrected(true)
+
+    def fitted(cable, start):
+        evidence = cable.evidence()
+        return evidence, improve(evidence, evaluate(evidence, [start]), 40, tolerance=1e-6)[0]
+
+    evidence, fit = fitted(corrected, at(cable))
+    expected = resolution(evidence, fit)
+    finer = dataclasses.replace(corrected, correction=corrected.correction / (1 - 1.6**-2))
+    _, again = fitted(finer, fit.explanation)
+    moved = again.explanation.z - fit.explanation.z
+    assert np.abs(moved).max() > 1e-4
+    np.testing.assert_allclose(expected, moved, atol=0.1 * np.abs(moved).max())
+    found = estimate_at(evidence, fit)
+    assert found.stiffness.low < cases.NOMINAL * np.exp(0.7) < found.stiffness.high
+    np.testing.assert_allclose(
+        found.shifts[-1] @ found.shifts[-1], ((expected @ cable.directions(fit.explanation)[0]) ** 2).sum()
+    )
 
 
 def test_what_was_done_is_read_back(cable, tmp_path):

@@ -3,10 +3,10 @@
 The search keeps an effect only if it improves predictions on held-out recordings. This is strict: drag, a stiffness
 profile or a recording's own grip may be present and yet not help elsewhere. Leaving out such an effect biases the
 others by the same amount in all recordings, which resampling of the recordings cannot show. Here all effects that were
-tried are therefore free, whether the search kept them or not. An interval has two parts: how a value changes when
-recordings are left out (jackknife), and how it changes when the priors move by their standard deviation. Neither covers
-deviations of the cable from the fitted law; reported intervals (`named`) are widened by the effect of such deviations
-on synthetic cables.
+tried are therefore free, whether the search kept them or not. An interval has three parts: how a value changes when
+recordings are left out (jackknife), when the priors move by their standard deviation, and when the rod's edges and time
+steps become shorter. None covers deviations of the cable from the fitted law; reported intervals (`named`) are widened
+by the effect of such deviations on synthetic cables.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.refits import independent
-from cablejax.spatial.cable import TWISTED, SpatialCable
+from cablejax.spatial.cable import MORE_EDGES, TWISTED, SpatialCable
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.growing import beginning
 
@@ -100,7 +100,8 @@ class Estimate:
         layout: of the values.
         explanation: that was fitted.
         moves: what leaving out each recording does to the shared values, see `jackknife`, shape [R, P].
-        shifts: what moving each prior by its standard deviation does to them, shape [K, P].
+        shifts: what moving each prior by its standard deviation does to them, and last what the error of the corrected
+            predictions does, as `resolution` has it, shape [K + 1, P].
         speed: of the keypoints, root mean square [m/s].
         settled: whether no value moved by more than a small part of its standard error when predictions were last
             corrected for finite edges and time steps.
@@ -231,6 +232,7 @@ def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
     # of the vector by the coordinates
     slopes = cable.directions(one)[0]
     moves, shifts = _rows(evidence, fit)
+    shifts = np.vstack([shifts, resolution(evidence, fit)])
     return Estimate(cable.layout, one, moves @ slopes, shifts @ slopes, cable.windows.speed)
 
 
@@ -244,6 +246,26 @@ def _rows(evidence: Evidence, fit: Fit) -> tuple[Float[np.ndarray, "R K"], Float
     return jackknife(evidence, fit), np.linalg.inv(fit.precision(evidence))
 
 
+def resolution(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "K"]:
+    """What the error that corrected predictions still have does to the shared coordinates, by one Gauss-Newton step.
+
+    It falls with the square of the number of edges, so it is a part of the correction (Richardson 1911). If a cable
+    bends over less than an edge, as next to a gripper, an estimate may rest on it.
+
+    Args:
+        evidence: of a `SpatialCable.corrected`.
+        fit: to it.
+    """
+    cable = evidence.simulator
+    assert isinstance(cable, SpatialCable) and cable.correction is not None
+    finer = dataclasses.replace(cable, correction=cable.correction / (1 - MORE_EDGES**-2))
+    (there,) = evaluate(dataclasses.replace(evidence, simulator=finer), [fit.explanation])
+    weight = evidence.weight(fit.sse)
+    here, moved = fit.model(weight, 0.0), there.model(weight, 0.0)
+    found = -solve_arrow(here.curvature, moved.gradient - here.gradient, here.blocks)
+    return _bounded(found)[: len(fit.explanation.z)]
+
+
 def jackknife(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "R K"]:
     """Change of the shared coordinates when each recording is left out, by one Gauss-Newton step (Miller 1974).
 
@@ -254,8 +276,12 @@ def jackknife(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "R K"]:
 
     def step(use):
         model = fit.model(np.where(use, weight, 0.0), 0.0)
-        found = -solve_arrow(model.curvature, model.gradient, model.blocks)
-        return (found * min(1.0, _LARGEST_STEP / max(np.abs(found).max(initial=0.0), 1e-12)))[: len(fit.explanation.z)]
+        return _bounded(-solve_arrow(model.curvature, model.gradient, model.blocks))[: len(fit.explanation.z)]
 
     full = step(np.ones(len(label), bool))
     return np.sqrt((len(names) - 1) / len(names)) * np.array([step(label != name) - full for name in names])
+
+
+def _bounded(step: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
+    """A step, or as much of it as the linear picture reaches."""
+    return step * min(1.0, _LARGEST_STEP / max(np.abs(step).max(initial=0.0), 1e-12))

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import t
 
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate
 from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS
@@ -23,7 +23,7 @@ _HIDDEN = 0.25
 SURE = 0.95
 """An effect is named where an interval that holds its value in this share of cases leaves its absence out. By the 90 %
 that are reported too many were named that the cables to choose on of `34_fresh_cables.py` do not have."""
-_WIDER = float(norm.ppf(0.5 + 0.5 * SURE) / norm.ppf(0.95))
+_REPORTED = 0.95  # quantile at which reported intervals end
 _DRAGS = ("viscous_drag", "quadratic_drag")
 _WHOLE, _STIFFNESS, _DRAG = "bending_stiffness", "stiffness_over_density_m4_per_s2", "drag_at_speed_per_s"
 _TELLING = {
@@ -52,6 +52,8 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
     layout = estimate.layout
     hidden = _HIDDEN * windows.interval / found.time_steps.substeps
     damping = max(float(layout.null[layout.slices["damping_time"]].item()), hidden)
+    recordings = len(estimate.moves) - 1
+    wider = float(t.ppf(0.5 + 0.5 * SURE, recordings) / t.ppf(_REPORTED, recordings))
     # motion shows the drags' sum: it goes by the names that stayed in the search, or by that of the larger one
     drags = [name for name in found.effects if name in _DRAGS] or [_main_drag(estimate)]
     for name in dict.fromkeys((*found.effects, *found.tried)):
@@ -60,7 +62,7 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
         parameters, along = parameters_of(
             name, estimate, density, placed=windows.placed, first_clamp=windows.first_clamp
         )
-        if _shown(name, parameters[_TELLING[name]], damping, longer_only=damping == hidden):
+        if _shown(name, parameters[_TELLING[name]], wider, damping, longer_only=damping == hidden):
             named.append(NamedEffect(name, None, parameters, {"along_cable_m": along, "time_s": None, "table_m": None}))
     return tuple(named)
 
@@ -96,12 +98,13 @@ def _main_drag(estimate: Estimate) -> str:
     return _DRAGS[int(estimate.speed * quadratic > linear)]
 
 
-def _shown(effect: str, parameter: ParameterEstimate, damping: float, *, longer_only: bool) -> bool:
+def _shown(effect: str, parameter: ParameterEstimate, wider: float, damping: float, *, longer_only: bool) -> bool:
     """Whether it is as good as excluded that the effect is absent.
 
     Args:
         effect: name.
         parameter: that says how far it is from its absence.
+        wider: an interval that is sure over the one that is reported.
         damping: time that a damping is compared with [s]: the one believed, or the shortest that time steps show.
         longer_only: whether a shorter one is indistinguishable from it.
     """
@@ -112,7 +115,7 @@ def _shown(effect: str, parameter: ParameterEstimate, damping: float, *, longer_
     elif _TELLING[effect] == "ratio":
         ends = np.log(ends)
     value, low, high = ends
-    above, below = value - _WIDER * (value - low) > 0, value + _WIDER * (high - value) < 0
+    above, below = value - wider * (value - low) > 0, value + wider * (high - value) < 0
     return bool(above.any() or (below.any() and not (damped and longer_only)))
 
 
@@ -206,7 +209,9 @@ def _section(estimate: Estimate) -> tuple[int, Interval]:
     profile = estimate.shared[where]
     knot = int(np.abs(profile - profile.mean()).argmax())
     rest = np.array([i for i in range(PROFILE_KNOTS) if i != knot])
-    return knot, estimate.ratio(lambda values: values[where][knot] - values[where][rest].mean())
+    # the largest of so many differences is large by chance more often than one of them
+    log = estimate.of(lambda values: values[where][knot] - values[where][rest].mean()).among(PROFILE_KNOTS)
+    return knot, Interval(*np.exp(dataclasses.astuple(log)).tolist())
 
 
 def _reported(interval: Interval, unit: str, *, times: float = 1.0) -> ParameterEstimate:
