@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t
 
@@ -62,7 +63,11 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
         parameters, along = parameters_of(
             name, estimate, density, placed=windows.placed, first_clamp=windows.first_clamp
         )
-        if _shown(name, parameters[_TELLING[name]], wider, damping, longer_only=damping == hidden):
+        if name == "bending_damping":
+            there = _damped(estimate, parameters["time_s"], wider, damping, longer_only=damping == hidden)
+        else:
+            there = _shown(name, parameters[_TELLING[name]], wider)
+        if there:
             named.append(NamedEffect(name, None, parameters, {"along_cable_m": along, "time_s": None, "table_m": None}))
     return tuple(named)
 
@@ -98,25 +103,40 @@ def _main_drag(estimate: Estimate) -> str:
     return _DRAGS[int(estimate.speed * quadratic > linear)]
 
 
-def _shown(effect: str, parameter: ParameterEstimate, wider: float, damping: float, *, longer_only: bool) -> bool:
+def _shown(effect: str, parameter: ParameterEstimate, wider: float) -> bool:
     """Whether it is as good as excluded that the effect is absent.
 
     Args:
         effect: name.
         parameter: that says how far it is from its absence.
         wider: an interval that is sure over the one that is reported.
-        damping: time that a damping is compared with [s]: the one believed, or the shortest that time steps show.
-        longer_only: whether a shorter one is indistinguishable from it.
     """
     ends = np.reshape(np.array(parameter.ci90, float), (-1, 2)).T
-    ends, damped = np.stack([np.ravel(parameter.value), *ends]), effect == "bending_damping"
-    if damped:
-        ends = np.log(ends / damping)
-    elif _TELLING[effect] == "ratio":
-        ends = np.log(ends)
-    value, low, high = ends
-    above, below = value - wider * (value - low) > 0, value + wider * (high - value) < 0
-    return bool(above.any() or (below.any() and not (damped and longer_only)))
+    ends = np.stack([np.ravel(parameter.value), *ends])
+    value, low, high = np.log(ends) if _TELLING[effect] == "ratio" else ends
+    return bool((value - wider * (value - low) > 0).any() or (value + wider * (high - value) < 0).any())
+
+
+def _damped(estimate: Estimate, time: ParameterEstimate, wider: float, compared: float, *, longer_only: bool) -> bool:
+    """Whether it is as good as excluded that the cable is damped as little as another one.
+
+    Were it so, the prior, which expects some damping, would draw the estimate towards longer times.
+
+    Args:
+        estimate: in which the damping is free.
+        time: its time [s].
+        wider: an interval that is sure over the one that is reported.
+        compared: time that it is compared with [s]: the one believed, or the shortest that time steps show.
+        longer_only: whether a shorter one is indistinguishable from that.
+    """
+    value, low, high = np.log(np.append(time.value, np.array(time.ci90)) / compared)
+    drawn = estimate.drawn(
+        "bending_damping", lambda values: jnp.log(values[estimate.layout.slices["damping_time"].start])
+    )
+    (prior,) = estimate.layout.named("bending_damping").parameters
+    value_if_so = drawn * math.log(prior.centre / compared) / prior.scale
+    longer = value - wider * (value - low) > max(value_if_so, 0.0)
+    return bool(longer or (value + wider * (high - value) < min(value_if_so, 0.0) and not longer_only))
 
 
 def parameters_of(
@@ -209,9 +229,7 @@ def _section(estimate: Estimate) -> tuple[int, Interval]:
     profile = estimate.shared[where]
     knot = int(np.abs(profile - profile.mean()).argmax())
     rest = np.array([i for i in range(PROFILE_KNOTS) if i != knot])
-    # the largest of so many differences is large by chance more often than one of them
-    log = estimate.of(lambda values: values[where][knot] - values[where][rest].mean()).among(PROFILE_KNOTS)
-    return knot, Interval(*np.exp(dataclasses.astuple(log)).tolist())
+    return knot, estimate.ratio(lambda values: values[where][knot] - values[where][rest].mean())
 
 
 def _reported(interval: Interval, unit: str, *, times: float = 1.0) -> ParameterEstimate:
