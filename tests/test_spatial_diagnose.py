@@ -23,10 +23,11 @@ from cablejax.simulate.rod.clamps import frames_along
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock, thinned, with_poses_in_time
 from cablejax.spatial.diagnose import _equivalent, _ranking, diagnose_space
+from cablejax.spatial.estimate import Estimate
 from cablejax.spatial.gap import OWN, in_log, is_gap, own_error, smallest_gap, where_of, with_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import TWISTED, Identified, _twisted, layout_of
-from cablejax.spatial.named import _shown
+from cablejax.spatial.named import _damped
 from cablejax.spatial.search import Step, falls, halves
 from cablejax.spatial.windows import windows_of
 
@@ -104,11 +105,24 @@ def test_a_stated_damping_is_believed():
     windows = windows_of(cases.recording())
     layout = layout_of(windows, cases.NOMINAL, 0.04)
     assert float(layout.physics(layout.null).damping_time) == pytest.approx(0.04)
-    interval = ParameterEstimate(0.041, (0.037, 0.046), "s")
-    assert _shown("bending_damping", interval, 0.001, longer_only=True)
-    assert not _shown("bending_damping", interval, 0.04, longer_only=False)
-    assert _shown("bending_damping", interval, 0.1, longer_only=False), "less than stated"
-    assert not _shown("bending_damping", interval, 0.1, longer_only=True)
+
+    def damped(value, low, high, compared, *, longer_only, drawn=0.0):
+        one = explanation((layout.named("bending_damping"), 0, (value,)))
+        shifts = np.zeros((2, layout.size))
+        shifts[0, layout.slots("bending_damping")] = drawn * value
+        estimate = Estimate(layout, one, np.zeros((9, layout.size)), shifts, 0.5)
+        time = ParameterEstimate(value, (low, high), "s")
+        return _damped(estimate, time, 1.2, compared, longer_only=longer_only)
+
+    interval = 0.041, 0.037, 0.046
+    assert damped(*interval, 0.001, longer_only=True)
+    assert not damped(*interval, 0.04, longer_only=False)
+    assert damped(*interval, 0.1, longer_only=False), "less than stated"
+    assert not damped(*interval, 0.1, longer_only=True)
+    short = 0.0043, 0.0030, 0.0062
+    assert damped(*short, 0.0025, longer_only=True)
+    assert not damped(*short, 0.0025, longer_only=True, drawn=0.2), "its prior makes as much of an undamped cable"
+    assert damped(*interval, 0.0025, longer_only=True, drawn=0.2)
 
 
 def test_a_gap_is_more_than_the_simulator_may_err_by():

@@ -119,27 +119,24 @@ class Estimate:
         """Values that all recordings share."""
         return self.explanation.vector(self.layout.effects)
 
-    def _slope(self, quantity: Quantity) -> tuple[float, Float[np.ndarray, "P"]]:
-        """A quantity and its derivative by the values."""
-        with jax.enable_x64(True):
-            value, slope = jax.value_and_grad(quantity)(jnp.asarray(self.shared, float))
-        return float(value), np.asarray(slope)
-
     def with_only(self, effects: Collection[str]) -> Explanation:
         """What was fitted, without the effects that are not among these."""
         return self.explanation.without(*(set(self.explanation.names) - set(effects)))
 
     def of(self, quantity: Quantity) -> Interval:
         """A quantity, its interval by its slope at the fitted values."""
-        value, slope = self._slope(quantity)
+        with jax.enable_x64(True):
+            value, slope = jax.value_and_grad(quantity)(jnp.asarray(self.shared, float))
+        value, slope = float(value), np.asarray(slope)
         left_out = t.ppf(_TAIL, len(self.moves) - 1) * np.linalg.norm(self.moves @ slope)
         error = float(np.hypot(left_out, norm.ppf(_TAIL) * np.linalg.norm(self.shifts @ slope)))
         return Interval(value, value - error, value + error)
 
-    def drawn(self, effect: str, quantity: Quantity) -> float:
-        """How far a standard deviation of the prior of an effect with one parameter moves a quantity."""
-        names = [p for name in self.explanation.names for p in [name] * len(self.layout.named(name).parameters)]
-        return float(self.shifts[names.index(effect)] @ self._slope(quantity)[1])
+    def drawn(self, effect: str) -> float:
+        """How far a standard deviation of the prior of an effect with one positive value moves its logarithm."""
+        names = [name for name in self.explanation.names for _ in self.layout.named(name).parameters]
+        where = self.layout.slots(effect).start
+        return float(self.shifts[names.index(effect), where] / self.shared[where])
 
     def ratio(self, log: Quantity) -> Interval:
         """A positive quantity by its logarithm."""

@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t
 
@@ -130,11 +129,8 @@ def _damped(estimate: Estimate, time: ParameterEstimate, wider: float, compared:
         longer_only: whether a shorter one is indistinguishable from that.
     """
     value, low, high = np.log(np.append(time.value, np.array(time.ci90)) / compared)
-    drawn = estimate.drawn(
-        "bending_damping", lambda values: jnp.log(values[estimate.layout.slices["damping_time"].start])
-    )
     (prior,) = estimate.layout.named("bending_damping").parameters
-    value_if_so = drawn * math.log(prior.centre / compared) / prior.scale
+    value_if_so = estimate.drawn("bending_damping") * math.log(prior.centre / compared) / prior.scale
     longer = value - wider * (value - low) > max(value_if_so, 0.0)
     return bool(longer or (value + wider * (high - value) < min(value_if_so, 0.0) and not longer_only))
 
