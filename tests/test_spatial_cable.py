@@ -187,7 +187,8 @@ def test_what_finer_edges_would_do_is_part_of_an_interval(cable):
 
     evidence, fit = fitted(corrected, at(cable))
     expected = resolution(evidence, fit)
-    finer = dataclasses.replace(corrected, correction=corrected.correction / (1 - 1.6**-2))
+    coarse, fine = (rod.predict([fit.explanation], np.arange(len(cable.windows)))[0] for rod in (cable, cable.exact(1)))
+    finer = dataclasses.replace(corrected, correction=corrected.correction + (fine - coarse) / (1.6**2 - 1))
     _, again = fitted(finer, fit.explanation)
     moved = again.explanation.z - fit.explanation.z
     assert np.abs(moved).max() > 1e-4

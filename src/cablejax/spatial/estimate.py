@@ -253,10 +253,10 @@ def _rows(evidence: Evidence, fit: Fit) -> tuple[Float[np.ndarray, "R K"], Float
 
 
 def resolution(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "K"]:
-    """What the error that corrected predictions still have does to the shared coordinates, by one Gauss-Newton step.
+    """What the error of the edges in corrected predictions does to the shared coordinates, by one Gauss-Newton step.
 
-    It falls with the square of the number of edges, so it is a part of the correction (Richardson 1911). If a cable
-    bends over less than an edge, as next to a gripper, an estimate may rest on it.
+    It falls with the square of their number, so that the difference between two numbers shows it (Richardson 1911). If
+    a cable bends over less than an edge, as next to a gripper, an estimate may rest on it.
 
     Args:
         evidence: of a `SpatialCable.corrected`.
@@ -264,7 +264,9 @@ def resolution(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "K"]:
     """
     cable = evidence.simulator
     assert isinstance(cable, SpatialCable) and cable.correction is not None
-    finer = dataclasses.replace(cable, correction=cable.correction / (1 - MORE_EDGES**-2))
+    plain = dataclasses.replace(cable, correction=None)
+    coarse, fine = (rod.predict([fit.explanation], evidence.episodes)[0] for rod in (plain, cable.exact(1)))
+    finer = dataclasses.replace(cable, correction=cable.correction + (fine - coarse) / (MORE_EDGES**2 - 1))
     (there,) = evaluate(dataclasses.replace(evidence, simulator=finer), [fit.explanation])
     weight = evidence.weight(fit.sse)
     here, moved = fit.model(weight, 0.0), there.model(weight, 0.0)
