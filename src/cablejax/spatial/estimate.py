@@ -55,8 +55,8 @@ UNMODELLED: Mapping[str, float] = MappingProxyType(
 """By how much an effect's parameter is off besides, in all recordings alike, where neither jackknife nor priors show
 it: standard deviation of its logarithm; of an angle in rad. It is what makes 90 % and 95 % intervals hold the true
 value as often as that on the next synthetic cable, by those to choose on, of two simulators that have more than the law
-that is fitted (`experiments/34_fresh_cables.py --calibrate`). Intervals of the drag at the recording's speed and of the
-markers' mass were wide enough."""
+that is fitted (`experiments/34_fresh_cables.py --calibrate`). These are 0.85 to 1 m long. Intervals of the drag at the
+recording's speed and of the markers' mass were wide enough."""
 
 
 @dataclasses.dataclass(frozen=True)
