@@ -15,7 +15,7 @@ from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import FINER, TWISTED, SpatialCable
-from cablejax.spatial.diagnose import _caveats
+from cablejax.spatial.caveats import caveats
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, restarts
 from cablejax.spatial.identify import Identified, TimeSteps, _for_predictions, layout_of
 from cablejax.spatial.named import named_effects, parameters_of, quantities_of, with_both_drags
@@ -218,13 +218,24 @@ def _valued(everything, values):
 
 def test_values_that_the_simulators_own_error_may_hide_are_said_to_be_unsure(found):
     def said(part, *, compared=None, own=1e-4, after=1e-4):
-        return sum(part in words for words in _caveats(found.cable.windows, 0, found, compared, own, after))
+        return sum(part in words for words in caveats(found.cable.windows, 0, found, compared, own, after))
 
     unsure, nominal, begun = "more than their intervals: record", "errors of the nominal cable", "The gap is therefore"
     assert not said(unsure) and not said(nominal) and not said(begun)
     assert said(nominal, own=0.06) == 1 and not said(unsure, own=0.06)
     assert said(unsure, after=0.06) == 1 and not said(nominal, after=0.06)
     assert said(begun, compared=1.0) == 1
+
+
+def test_a_cable_that_bends_over_too_short_or_too_long_a_stretch_is_said_to(found, everything):
+    def said(times):
+        values = everything.shared.copy()
+        values[everything.layout.slices["ratio"]] *= times
+        words = caveats(found.cable.windows, 0, _at(found, values), None, 1e-4, 1e-4)
+        return [part for part in words if part.startswith("By its estimated stiffness")]
+
+    assert not said(1)
+    assert "less than an edge" in said(1e-3)[0] and "more than a third of its length" in said(1e2)[0]
 
 
 def test_a_clamp_beyond_the_last_keypoint_is_no_keypoint(found, everything):

@@ -13,18 +13,17 @@ from jaxtyping import Float
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
-from cablejax.diagnose.judgement import judged, listed, verdict_sentence
+from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.diagnose.log_faults import as_measured
 from cablejax.diagnose.protocol import explanation
 from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.provenance import package_versions
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
-from cablejax.spatial.cable import GOOD_FIT, SpatialCable, errors
+from cablejax.spatial.cable import SpatialCable, errors
+from cablejax.spatial.caveats import caveats
 from cablejax.spatial.clock import on_one_clock, with_poses_in_time
-from cablejax.spatial.effects import GRIP
 from cablejax.spatial.gap import (
-    OWN,
     constant_offset,
     gap_of,
     in_log,
@@ -125,7 +124,7 @@ def diagnose_space(
             *resampled,
             *shifted,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(windows, left_out, found, cut, own, own_after),
+            *caveats(windows, left_out, found, cut, own, own_after),
         ),
         log=log,
         nominal=nominal,
@@ -217,79 +216,3 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
         ranked.append(Ranked(step.effect, None, gain, 1e3 * float(error.mean()), outcome))
         before = error if step.accepted else before
     return tuple(ranked)
-
-
-def _caveats(windows, left_out, found, compared_s, own, own_after) -> tuple[str, ...]:
-    result = [
-        "The motion of a hanging cable does not depend on its weight. Stiffness, drag and added masses are estimated "
-        "relative to the linear density of the cable with its markers, and a wrong density (linear_density) is not "
-        "identifiable.",
-        "A lag between keypoints and separately measured gripper poses is not an effect in space; it is estimated from "
-        "the keypoints at the grippers."
-        if windows.rolls
-        else (
-            "Keypoints and gripper poses come from the same markers, so a camera lag would shift both alike: "
-            "camera_lag is not identifiable."
-        ),
-        "The noise is the scatter of markers from one sample to the next. A marker that sits off the centreline or "
-        "off its stated arc length has a constant error. That error belongs to the constant offsets, not to the "
-        "noise, and so does the simulator's error at rest.",
-        "The grippers' roll about the cable is taken from the log's quaternions."
-        if windows.rolls
-        else (
-            "The grippers' roll about the cable is not observed, or the roll in the log does not bring the nominal "
-            "simulation closer to the recording. It is assumed to be the smallest rotation from their mean direction."
-        ),
-        "All effects that were tried are fitted together. The gap after is the error with the named effects, at their "
-        "values from that fit, on recordings that no fit has seen.",
-    ]
-    if "gripper_rotation_offset" in found.tried:
-        grips = GRIP * found.everything.explanation.own[np.unique(windows.group)]
-        result.append(
-            "The angle of the cable in the grippers is fitted for each recording: it differs by "
-            f"{np.sqrt((grips**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen "
-            "are predicted with the mean."
-        )
-    if compared_s is not None:
-        result.append(
-            "The nominal cable amplifies the noise in the first two samples of each window until it moves as far from "
-            f"itself as from the recording. The gap is therefore that of the first {compared_s:g} s of each window."
-        )
-    if own > OWN:
-        result.append(
-            "Noise in the first two samples of each window and the edges of the simulated cable alone cause errors of "
-            f"the nominal cable of {1e3 * own:.1f} mm. Errors of up to 1.5 times this size do not count as a gap."
-        )
-    if own_after > GOOD_FIT:
-        result.append(
-            "Noise in the first two samples of each window alone causes errors of the explained cable of "
-            f"{1e3 * own_after:.1f} mm, which are part of the gap after. The values fitted to such motion may be off "
-            "by more than their intervals: record slower ones."
-        )
-    if windows.smoothed:
-        result.append(
-            f"The grippers' measured paths scatter by {1e3 * windows.smoothed:.2g} mm from one sample to the next. "
-            "They were smoothed. The remaining scatter shakes the simulated cable, so a bending damping may be "
-            "overestimated."
-        )
-    if left_out:
-        result.append(f"{left_out} windows are labelled eval; they were used neither for fits nor for scores.")
-    if not found.time_steps.fine_enough:
-        result.append(
-            "The grippers move too fast for the finest time steps of the simulation: halving these would change the "
-            f"motion by {1e3 * found.time_steps.error:.1f} mm. Gaps of that size may be the simulation's own error."
-        )
-    parts = ("one half of the recordings", "the other half", "all recordings")
-    if moving := [part for part, one in zip(parts, (*found.halves, found.everything), strict=True) if not one.settled]:
-        result.append(
-            f"The parameters of the fit to {listed(moving)} still changed in the last correction for the length of the "
-            "simulator's edges and time steps: they may be off by more than their intervals."
-        )
-    groups = len(np.unique(windows.group))
-    if groups == 1:
-        result.append(
-            "There is only one recording: intervals are over its windows, without what differs between recordings."
-        )
-    elif groups < 6:
-        result.append(f"There are only {groups} recordings: intervals over recordings are rough.")
-    return tuple(result)
