@@ -93,4 +93,5 @@ def test_a_richer_law_moves_the_same_cable_otherwise(fitted):
     assert richer.cable.rest_curvature.any() and richer.cable.roll
     off = np.abs(richer.recordings.keypoints - fitted.recordings.keypoints)
     np.testing.assert_array_equal(off[:, :, [0, 1, -2, -1]], 0)
-    assert (np.nanmean(off[:, :, 2:-2], axis=(0, 1, 3)) > 1e-3).all()
+    moved = np.nanmean(off[:, :, 2:-2], axis=(0, 1, 3))
+    assert (moved > 0).all() and moved.mean() > 1e-3
