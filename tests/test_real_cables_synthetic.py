@@ -75,6 +75,20 @@ def test_two_simulators_move_a_cable_alike():
     assert np.linalg.norm(links - rod, axis=-1).mean() < 0.02 * moved
 
 
+def test_links_that_break_down_are_simulated_in_shorter_steps(monkeypatch):
+    generator = np.random.default_rng(1)
+    cable = dataclasses.replace(drawn_cable(generator, 1), length=0.4, stiffness=0.2, damping_time=0.002)
+    position, direction = _motion(dataclasses.replace(cable, speed=0.2), generator, 1, 30)
+    frames = _rolled(direction, np.zeros(direction.shape[:3]))
+    monkeypatch.setattr(composite, "_STABLE", 12.0)
+    monkeypatch.setattr(composite, "_SHORTER", (1,))
+    arclength = np.linspace(0.0, cable.length, len(cable.offset) + 2)[1:-1]
+    assert composite.broken(composite.simulated(cable, arclength, position, frames, SAMPLE_INTERVAL), cable.length)
+    monkeypatch.setattr(composite, "_SHORTER", (1, 4, 16))
+    found = composite.simulated(cable, arclength, position, frames, SAMPLE_INTERVAL)
+    assert not composite.broken(found, cable.length) and cable.grips.any()
+
+
 @pytest.mark.parametrize("present", [[], ["drag"], ["bending_stiffness", "stiffness_profile"]])
 def test_a_cable_has_the_effects_that_it_is_given_and_no_others(present):
     cable = with_effects(drawn_cable(np.random.default_rng(2), 3), present, np.random.default_rng(3))

@@ -174,6 +174,10 @@ def test_grips_of_every_recording_are_found_and_leave_the_stiffness_alone(cable)
     assert np.abs(held[0] - held[1]).max() < 0.1 and np.abs(held[1]).max() > 0.3
     moves = jackknife(evidence, fits[True])
     assert moves.shape == (4, 6) and 0 < np.sqrt((moves[:, 0] ** 2).sum()) < 0.2
+    # seen by the same rod: there is nothing to correct
+    corrected = dataclasses.replace(seen, correction=np.zeros_like(evidence.observed))
+    told = estimate_at(corrected.evidence(), fits[True]).stiffness
+    assert told.low < cases.NOMINAL * np.exp(0.7) < told.high
 
 
 def test_what_finer_edges_would_do_is_part_of_an_interval(cable):

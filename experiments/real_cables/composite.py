@@ -33,7 +33,7 @@ _RADIUS = 0.28
 _JUMP = 0.2
 """No motion moves a marker so far from one sample to the next, over the cable's length."""
 _DAMPED = 200.0
-"""Damping time over that of the fastest vibration, at most: grips are welds, and give way where dampers are stiffer."""
+"""Damping time times the fastest vibration's frequency, at most: welds of grips yield to stiffer dampers."""
 _SETTLE, _SETTLE_DRAG = 1.0, 8.0
 """Time before the grippers move in which the cable comes to rest [s], and the drag that brings it there [1/s]."""
 _WELD = "0.0015 1"

@@ -114,7 +114,7 @@ def _on_fits(windows: Windows, found: Identified) -> list[str]:
     elif bends > length / _STIFF:
         why = (
             "more than a third of its length, so its weight says little of the stiffness, and twist and markers off "
-            "the centreline, which are not simulated, move it as far"
+            "the centreline, which are not simulated, weigh more"
         )
     if why:
         result.append(

@@ -4,9 +4,9 @@ The search keeps an effect only if it improves predictions on held-out recording
 profile or a recording's own grip may be present and yet not help elsewhere. Leaving out such an effect biases the
 others by the same amount in all recordings, which resampling of the recordings cannot show. Here all effects that were
 tried are therefore free, whether the search kept them or not. An interval has three parts: how a value changes when
-recordings are left out (jackknife), when the priors move by their standard deviation, and when the rod's edges and time
-steps become shorter. None covers deviations of the cable from the fitted law; reported intervals (`named`) are widened
-by the effect of such deviations on synthetic cables.
+recordings are left out (jackknife), when the priors move by their standard deviation, and when the rod's edges become
+shorter. None covers deviations of the cable from the fitted law; reported intervals (`named`) are widened by the effect
+of such deviations on synthetic cables.
 """
 
 from __future__ import annotations

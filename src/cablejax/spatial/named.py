@@ -52,8 +52,8 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
     layout = estimate.layout
     hidden = _HIDDEN * windows.interval / found.time_steps.substeps
     damping = max(float(layout.null[layout.slices["damping_time"]].item()), hidden)
-    recordings = len(estimate.moves) - 1
-    wider = float(t.ppf(0.5 + 0.5 * SURE, recordings) / t.ppf(_REPORTED, recordings))
+    freedom = len(estimate.moves) - 1
+    wider = float(t.ppf(0.5 + 0.5 * SURE, freedom) / t.ppf(_REPORTED, freedom))
     # motion shows the drags' sum: it goes by the names that stayed in the search, or by that of the larger one
     drags = [name for name in found.effects if name in _DRAGS] or [_main_drag(estimate)]
     for name in dict.fromkeys((*found.effects, *found.tried)):
