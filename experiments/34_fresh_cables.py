@@ -23,6 +23,8 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("NPROC", "4")
+# with more threads rods of more than 32 edges take twenty times as long
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from scipy.stats import norm
@@ -257,11 +259,11 @@ def page(rows: list[dict[str, Any]], narrow: list[dict[str, Any]], made: str) ->
         f"of {LENGTH[0]:g} to {LENGTH[1]:g} m and EI/rho of {STIFFNESS[0]:g} to {STIFFNESS[1]:g} m^4/s^2, each with "
         f"{SECONDS:g} s of recordings of {' or '.join(f'{d:g}' for d in DURATIONS)} s at {1 / SAMPLE_INTERVAL:g} Hz, "
         "through the repairs and the protocol of the [real recordings](real_cables.md). Odd seeds are simulated by a "
-        "rod with twice the edges of the fitted one, and with a rest curvature, markers off the centreline and "
-        "grippers that roll, which are not tried; even seeds by links on ball joints in MuJoCo, which share no code "
-        "with the fit. In a fifth of the recordings a gripper is struck, in a fifth a marker is not seen for a while, "
-        "in a fifth another point is taken for one. Each effect is there with a chance of one half: EI/rho off the "
-        "value that is believed by a factor of 1.3 or more, damping of 0.01 to 0.3 s, drag of 0.2 to 0.8 1/s at the "
+        "rod of 64 edges, and with a rest curvature, markers off the centreline and grippers that roll, which are not "
+        "tried; even seeds by 32 to 48 links on ball joints in MuJoCo, which share no code with the fit. In a fifth of "
+        "the recordings a gripper is struck, in a fifth a marker is not seen for a while, in a fifth another point is "
+        "taken for one. Each effect is there with a chance of one half: EI/rho off the value that is believed by a "
+        "factor of 1.3 or more, damping of 0.01 to 0.3 s, drag of 0.2 to 0.8 1/s at the "
         "grippers' speed, split at random between both laws, EI somewhere off its mean by about 30 % or more, grips "
         "turned with a standard deviation of 0.2 rad in all recordings and 0.2 rad more in each. An effect shows "
         f"where the markers of the cable without it would be elsewhere, by {1e3 * SHOWS:g} mm or more (median over "

@@ -27,6 +27,8 @@ from collections.abc import Sequence
 from typing import Any
 
 os.environ.setdefault("NPROC", "4")
+# with more threads rods of more than 32 edges take twenty times as long
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from jaxtyping import Float

@@ -32,6 +32,7 @@ def run(out: pathlib.Path) -> tuple[list[str], str]:
     return out.with_suffix(".jsonl").read_text().splitlines(), out.read_text()
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_and_repeats_nothing(tmp_path, two_cases):
     out = tmp_path / "page.md"
     lines, text = run(out)

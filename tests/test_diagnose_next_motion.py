@@ -177,6 +177,7 @@ def designed() -> tuple[Judge, NextMotion]:
     return judge, next_motion(judge, DesignConfig(simulations=1500, patience=5))
 
 
+@pytest.mark.slow
 def test_designed_motion_is_worth_at_least_the_best_safe_one():
     judge, following = designed()
     assert following.motion == "designed" and following.ended in ("clear", "settled", "budget")

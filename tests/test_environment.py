@@ -269,6 +269,7 @@ def test_turning_grippers_do_not_tear_the_cable_out(turn):
     assert np.abs(seen["gripper_pose"][:, 2]).min() > 0.25
 
 
+@pytest.mark.slow
 def test_the_controller_is_a_policy():
     config = clean(steps=30, targets=("U",))
     length = config.cable.length

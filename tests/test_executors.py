@@ -141,6 +141,7 @@ def cluster(tmp_path):
             program.wait()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_cluster_that_loses_a_worker_loses_no_row(cluster, tmp_path):
     address, programs, worker = cluster

@@ -161,7 +161,6 @@ COMMANDS = {
 }
 KILLS = {"study": 5}
 """Of those commands that take minutes."""
-CHEAP = ["simulate", "closed loops"]
 PREPARED = ["shape", "diagnose", "demo"]
 
 
@@ -186,8 +185,7 @@ def prepared(folder: pathlib.Path) -> None:
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize(
     ("name", "kills"),
-    [(name, 1) for name in CHEAP]
-    + [pytest.param(name, KILLS.get(name, 20), marks=pytest.mark.slow) for name in COMMANDS],
+    [("simulate", 1), *(pytest.param(name, KILLS.get(name, 20), marks=pytest.mark.slow) for name in COMMANDS)],
 )
 def test_a_killed_command_loses_nothing_and_ends_in_the_same(name, kills, tmp_path):
     command, rng = COMMANDS[name], np.random.default_rng(0)

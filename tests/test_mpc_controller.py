@@ -124,6 +124,7 @@ def test_a_longer_cable_is_shaped_in_proportion():
     assert max(np.linalg.norm(twist * [1, 1, 0.15], axis=1).max() for twist, _ in steps[1.0]) > 0.049
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["U", "S"])
 def test_residual_removes_most_of_what_the_model_gets_wrong(target):
     _, _, without = run(controller(target, WITHOUT), Cable(), 25)

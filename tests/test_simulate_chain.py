@@ -346,6 +346,7 @@ def programs(request):
     return engine, jax.jit(final), push, pull
 
 
+@pytest.mark.slow
 def test_a_rollout_is_differentiable_within_programs_of_the_callers():
     engine = ChainEngine(Discretisation(n_links=5, timestep=0.05))
     physics, state = nominal_physics(engine.config), engine.initial_state(np.array([[-0.35, 0, 1], [0.35, 0, -1]]))

@@ -76,14 +76,21 @@ def test_derivatives_are_those_of_finite_differences(cable):
     np.testing.assert_allclose(along, central, atol=1e-5 * np.abs(central).max())
 
 
-def test_a_corrected_cable_is_a_finer_rod_at_one_place_and_moves_as_before(cable):
+def _extrapolated(cable, one, episodes, numbers, substeps):
+    """Of the polynomial in the squared length of an edge through what rods of these numbers predict, at zero."""
+    rods = [Rod(n, substeps, twisting=False, local_error=cable.rod.local_error * n / 16) for n in numbers]
+    found = np.stack([dataclasses.replace(cable, rod=rod).predict([one], episodes)[0] for rod in rods])
+    powers = np.vander(1 / np.square(numbers, dtype=float), increasing=True)
+    return np.linalg.solve(powers, found.reshape(len(numbers), -1))[0].reshape(found.shape[1:])
+
+
+def test_a_corrected_cable_is_an_extrapolated_one_at_one_place_and_moves_as_before(cable):
     one, episodes = at(cable, seed=1), np.array([0, 3])
     corrected = cable.corrected(one)
-    finer = dataclasses.replace(cable, rod=Rod(26, 4, twisting=False, local_error=1.6 * cable.rod.local_error))
     ((here, slopes),), ((_, plain),) = (c.linearise([one], episodes) for c in (corrected, cable))
     np.testing.assert_array_equal(slopes, plain)
     for predicted in (here, corrected.predict([one], episodes)[0]):
-        np.testing.assert_allclose(predicted, finer.predict([one], episodes)[0], atol=1e-12)
+        np.testing.assert_allclose(predicted, _extrapolated(cable, one, episodes, (16, 26), 4), atol=1e-12)
     # it says what is missing, not what was missing before, and nothing about other windows
     once, twice = corrected.correction, corrected.corrected(one).correction
     assert once is not None and twice is not None and 1e-4 < np.abs(once).max() < 0.05
@@ -191,8 +198,11 @@ def test_what_finer_edges_would_do_is_part_of_an_interval(cable):
 
     evidence, fit = fitted(corrected, at(cable))
     expected = resolution(evidence, fit)
-    coarse, fine = (rod.predict([fit.explanation], np.arange(len(cable.windows)))[0] for rod in (cable, cable.exact(1)))
-    finer = dataclasses.replace(corrected, correction=corrected.correction + (fine - coarse) / (1.6**2 - 1))
+    this, following = (
+        _extrapolated(cable, fit.explanation, np.arange(len(cable.windows)), numbers, 1)
+        for numbers in ((16, 26), (16, 20, 26))
+    )
+    finer = dataclasses.replace(corrected, correction=corrected.correction + following - this)
     _, again = fitted(finer, fit.explanation)
     moved = again.explanation.z - fit.explanation.z
     assert np.abs(moved).max() > 1e-4

@@ -326,6 +326,7 @@ def _softly_damped(times: int) -> tuple[SpatialCable, np.ndarray]:
     return cable.on(seen), cable.motion(explanation())
 
 
+@pytest.mark.slow
 def test_a_gap_shows_before_the_nominal_cable_amplifies_noise():
     noise = 3e-4
     short, nominal = _softly_damped(1)

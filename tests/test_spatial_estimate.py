@@ -176,10 +176,30 @@ def test_ei_over_rho_is_always_told_and_ei_where_the_density_is_known(found):
     assert quantities_of(dataclasses.replace(found, tried=("bending_damping",)), 0.05) == {}
 
 
+def _finer(cable):
+    return dataclasses.replace(cable, rod=Rod(48, FINER, twisting=False))
+
+
+def test_few_edges_are_extrapolated_to_ever_more_and_the_next_order_shows_what_is_left(fitted):
+    cable, best = fitted
+    exact, begun = cable.exact(), cable.windows.valid
+    motions = {name: part.motion(best) for name, part in (("this", exact), ("next", exact.with_next_order()))}
+    # 48 edges have a quarter of the error of 26
+    finer = _finer(cable).motion(best)
+    motions |= {"most": exact.with_most_edges().motion(best)}
+    motions |= {"true": finer + (finer - motions["most"]) / ((48 / 26) ** 2 - 1)}
+
+    def apart(one, other):
+        return np.abs(motions[one] - motions[other])[begun].mean()
+
+    left = apart("this", "true")
+    assert left < apart("most", "true") / 5
+    assert left < apart("this", "next") < apart("this", "most") / 3
+
+
 def test_few_edges_and_long_steps_do_not_pass_for_another_stiffness(fitted):
     cable, best = fitted
-    finer = dataclasses.replace(cable, rod=Rod(26, 8, twisting=False))
-    coarse = cable.on(dataclasses.replace(cable.windows, keypoints=finer.motion(best)))
+    coarse = cable.on(dataclasses.replace(cable.windows, keypoints=_finer(cable).motion(best)))
     evidence = coarse.evidence()
     (fit,) = improve(evidence, evaluate(evidence, [best]), max_iterations=40, tolerance=0.02)
     told = estimate(coarse, [best], _FOUND)
@@ -268,7 +288,7 @@ def test_names_only_what_the_estimate_shows(found, everything):
     assert "bending_damping" not in _named(found, hidden)
 
 
-def test_predictions_have_as_many_time_steps_as_matter(fitted):
+def test_predictions_have_as_many_edges_and_time_steps_as_matter(fitted):
     """Of what fits a motion at 50 Hz few are enough; of one of which nothing is left, all that it was corrected for."""
     cable, best = fitted
     noisy = dataclasses.replace(
@@ -276,9 +296,9 @@ def test_predictions_have_as_many_time_steps_as_matter(fitted):
         keypoints=cable.windows.keypoints + np.random.default_rng(0).normal(0, 0.02, cable.windows.keypoints.shape),
     )
     exact = dataclasses.replace(cable.windows, keypoints=cable.exact().motion(best))
-    few, all_ = (_for_predictions(cable.on(windows), best).rod for windows in (noisy, exact))
-    assert (few.substeps, all_.substeps) == (cable.rod.substeps, FINER * cable.rod.substeps)
-    assert few.n_edges == all_.n_edges > cable.rod.n_edges
+    few, all_ = (_for_predictions(cable.on(windows), best) for windows in (noisy, exact))
+    assert (few.rod.substeps, all_.rod.substeps) == (cable.rod.substeps, FINER * cable.rod.substeps)
+    assert (few.edges, all_.edges) == ((26,), (16, 26))
 
 
 def test_what_is_predicted_with_the_named_effects_alone_has_no_other(found, everything):

@@ -83,6 +83,7 @@ def exact(stiffness: float, clamps: np.ndarray, curvature_slope, guess: np.ndarr
     return found.sol(np.linspace(0, LENGTH, 41))[2:].T
 
 
+@pytest.mark.slow
 def test_the_shape_is_that_of_the_continuous_wire():
     errors = []
     for links in (40, 80, 160):
@@ -208,6 +209,7 @@ def names(diagnosis) -> tuple[str, ...]:
     return tuple(effect.name for effect in diagnosis.effects)
 
 
+@pytest.mark.slow
 def test_derivatives_of_photographs_are_those_of_finite_differences():
     hanging = HangingWire(photographs(5.0, 0.8))
     trial = explanation((EFFECTS[1], 0, (0.4, 0.3, 2.0)), (EFFECTS[3], 0, (0.01,)))

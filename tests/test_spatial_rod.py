@@ -106,6 +106,7 @@ def test_agrees_with_the_mujoco_composite(sideways, twisting):
     assert np.linalg.norm(reference - reference[0], axis=-1).max() > 0.25
 
 
+@pytest.mark.slow
 def test_second_order_in_the_time_step():
     arclength = np.linspace(0.1, 0.9, 9)
     position, frames = _inputs(80, 0.1)
@@ -237,7 +238,7 @@ def test_derivatives_are_those_of_finite_differences():
     np.testing.assert_allclose(derivative, difference, atol=2e-3 * float(np.abs(difference).max()))
 
 
-@pytest.mark.parametrize("twisting", [False, True])
+@pytest.mark.parametrize("twisting", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_damping_does_not_resist_a_cable_that_turns_as_a_whole(twisting):
     # both grippers are carried around the vertical and turn with it, and soon the cable does too
     arclength = np.linspace(0.1, 0.9, 7)

@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 if TYPE_CHECKING:
     from real_cables.synthetic import SyntheticCable
 
-EDGES = 32
-"""Links of the cable's length: one more, for half a link at each end is in a gripper."""
+_LINKS = 32, 48
+"""Links of the cable's length, at least and at most: one more, for half a link at each end is in a gripper."""
 _STEP = 5e-4
 """Longest time step [s]."""
 _STABLE = 1.2
-"""And as a phase of the fastest vibration [rad], for springs are explicit in MuJoCo."""
+"""And as a phase of the fastest vibration [rad], for springs are explicit in MuJoCo. More links vibrate faster."""
 _SHORTER = 1, 4, 16
 """It is divided by these in turn where a recording breaks down."""
 _DENSITY = 0.05
@@ -60,14 +60,15 @@ def simulated(
         position, frames: of the grippers; rows of a frame are its axes in the world.
         interval: between samples [s].
     """
-    model = mujoco.MjModel.from_xml_string(_xml(cable, arclength))
-    step, found = min(_STEP, _STABLE / _fastest(cable)), []
+    count = _links(cable)
+    model = mujoco.MjModel.from_xml_string(_xml(cable, count, arclength))
+    step, found = min(_STEP, _STABLE / _fastest(cable, count)), []
     for motion in zip(position, frames, cable.grips, strict=True):
         ends, seen = _ends(*motion), np.zeros(0)
         for shorter in _SHORTER:
             # samples are whole numbers of steps
             model.opt.timestep = interval / (shorter * math.ceil(interval / step))
-            seen = _recording(model, cable, arclength, ends, interval)
+            seen = _recording(model, cable, count, arclength, ends, interval)
             if not broken(seen, cable.length):
                 break
         found.append(seen)
@@ -81,21 +82,27 @@ def broken(markers: Float[np.ndarray, "*R T N 3"], length: float) -> bool:
 
 def longest_damping(cable: SyntheticCable) -> float:
     """The damping time up to which links can be simulated [s]: about half of what is critical for the first mode."""
-    return _DAMPED / _fastest(cable)
+    return _DAMPED / _fastest(cable, _LINKS[0])
 
 
-def _fastest(cable: SyntheticCable) -> float:
-    """Angular frequency of the links' fastest vibration [1/s]."""
-    return float(4 * np.sqrt(cable.stiffness * np.exp(cable.profile.max())) * (EDGES / cable.length) ** 2)
+def _fastest(cable: SyntheticCable, count: int) -> float:
+    """Angular frequency of the fastest vibration of so many links [1/s]."""
+    return float(4 * np.sqrt(cable.stiffness * np.exp(cable.profile.max())) * (count / cable.length) ** 2)
 
 
-def _recording(model, cable, arclength, ends: list[Ends], interval: float) -> Float[np.ndarray, "T N 3"]:
+def _links(cable: SyntheticCable) -> int:
+    """As many as neither take shorter time steps nor a shorter damping."""
+    fastest = min(_STABLE / _STEP, _DAMPED / cable.damping_time)
+    return int(np.clip(_LINKS[0] * np.sqrt(fastest / _fastest(cable, _LINKS[0])), *_LINKS))
+
+
+def _recording(model, cable, count, arclength, ends: list[Ends], interval: float) -> Float[np.ndarray, "T N 3"]:
     """One recording."""
-    edge = cable.length / EDGES
+    edge = cable.length / count
     data = mujoco.MjData(model)
-    data.qpos[:] = _standing(_bend_between(cable.length, ends[0]), ends[0], edge)
+    data.qpos[:] = _standing(_bend_between(cable.length, ends[0], count), ends[0], edge)
     begin = _first(data, model, edge)
-    links = slice(model.body("link0").id, model.body("link0").id + EDGES + 1)
+    links = slice(model.body("link0").id, model.body("link0").id + count + 1)
     weight = _DENSITY * edge
 
     def advance(samples: list[Ends], seconds: float, extra: float):
@@ -120,21 +127,21 @@ def _recording(model, cable, arclength, ends: list[Ends], interval: float) -> Fl
 
     for _ in advance([begin, ends[0]], _SETTLE, _SETTLE_DRAG):
         pass
-    link, along = _places(arclength, edge)
+    link, along = _places(arclength, edge, count)
     seen = []
     for _ in advance([ends[0], *ends], interval, 0.0):
         seen.append(data.xpos[links][link] + data.xmat[links].reshape(-1, 3, 3)[link, :, 0] * along[:, None])
     return np.array(seen)
 
 
-def _xml(cable, arclength) -> str:
-    edge = cable.length / EDGES
-    joints = (np.arange(1, EDGES + 1) - 0.5) * edge
+def _xml(cable, count, arclength) -> str:
+    edge = cable.length / count
+    joints = (np.arange(1, count + 1) - 0.5) * edge
     knots = np.linspace(0.0, cable.length, len(cable.profile))
     spring = _DENSITY * cable.stiffness * np.exp(np.interp(joints, knots, cable.profile)) / edge
-    markers = {int(link): along for link, along in zip(*_places(arclength, edge), strict=True)}
+    markers = {int(link): along for link, along in zip(*_places(arclength, edge, count), strict=True)}
     text, end = [], []
-    for k in range(EDGES + 1):
+    for k in range(count + 1):
         joint = (
             "<freejoint/>"
             if k == 0
@@ -151,19 +158,19 @@ def _xml(cable, arclength) -> str:
     welds = [
         f'<weld body1="grip{q}" body2="link{link}" relpose="{-edge / 2} 0 0 1 0 0 0" solref="{_WELD}" '
         'solimp="0.999 0.9999 0.001"/>'
-        for q, link in enumerate((0, EDGES))
+        for q, link in enumerate((0, count))
     ]
     return (
-        '<mujoco><option integrator="implicitfast"><flag contact="disable"/></option><worldbody>'
-        + '<body name="grip0" mocap="true"/><body name="grip1" mocap="true"/>'
+        '<mujoco><option integrator="implicitfast" jacobian="dense" solver="PGS"><flag contact="disable"/></option>'
+        + '<worldbody><body name="grip0" mocap="true"/><body name="grip1" mocap="true"/>'
         + "".join([*text, *end])
         + f"</worldbody><equality>{''.join(welds)}</equality></mujoco>"
     )
 
 
-def _places(arclength, edge):
+def _places(arclength, edge, count):
     """Link of every marker, and how far along it the marker is [m]; the first gripper holds the middle of link 0."""
-    link = np.minimum(((arclength + 0.5 * edge) / edge).astype(int), EDGES)
+    link = np.minimum(((arclength + 0.5 * edge) / edge).astype(int), count)
     return link, arclength + 0.5 * edge - edge * link
 
 
@@ -191,21 +198,22 @@ def hanging(
     length: float, position: Float[np.ndarray, "2 3"], arclength: Float[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N 3"]:
     """A guess of where markers are that hang between two places at about the same height [m]."""
-    bend = _bend_between(length, [(position[q], np.zeros(4)) for q in range(2)])
+    count = _LINKS[0]
+    bend = _bend_between(length, [(position[q], np.zeros(4)) for q in range(2)], count)
     way = position[1] - position[0]
     across = np.append(way[:2] / np.linalg.norm(way[:2]), 0.0)
     steps = np.cos(bend)[:, None] * across + np.sin(bend)[:, None] * np.array([0.0, 0.0, 1.0])
     middle = 0.5 * (steps[1:] + steps[:-1])
-    nodes = np.concatenate([np.zeros((1, 3)), np.cumsum(middle, axis=0) * length / EDGES])
-    nodes = position[0] + nodes + np.linspace(0, 1, EDGES + 1)[:, None] * (way - nodes[-1])
-    s = np.linspace(0, length, EDGES + 1)
+    nodes = np.concatenate([np.zeros((1, 3)), np.cumsum(middle, axis=0) * length / count])
+    nodes = position[0] + nodes + np.linspace(0, 1, count + 1)[:, None] * (way - nodes[-1])
+    s = np.linspace(0, length, count + 1)
     return np.stack([np.interp(arclength, s, column) for column in nodes.T], axis=1)
 
 
-def _bend_between(length: float, ends: Ends) -> Float[np.ndarray, "K"]:
+def _bend_between(length: float, ends: Ends, count: int) -> Float[np.ndarray, "K"]:
     """Angle of every link to the horizontal, from downwards to upwards, so that the cable reaches both ends [rad]."""
     way = np.linalg.norm((ends[1][0] - ends[0][0])[:2])
-    u = np.linspace(-1.0, 1.0, EDGES + 1)
+    u = np.linspace(-1.0, 1.0, count + 1)
 
     def angles(power):
         return 0.5 * np.pi * np.sign(u) * np.abs(u) ** power
@@ -227,5 +235,5 @@ def _standing(bend, ends: Ends, edge: float) -> Float[np.ndarray, "Q"]:
 def _first(data, model, edge: float) -> Ends:
     """The grippers where the cable is to begin with."""
     mujoco.mj_forward(model, data)
-    links = [model.body(f"link{k}").id for k in (0, EDGES)]
+    links = [model.body("link0").id, model.nbody - 1]
     return [(data.xpos[i] + 0.5 * edge * data.xmat[i].reshape(3, 3)[:, 0], data.xquat[i].copy()) for i in links]

@@ -1,8 +1,8 @@
 """Synthetic recordings of a cable in space whose parameters are known, for checks of the estimates.
 
 Cables are drawn at random from far wider ranges than the real ones span: 0.3 to 3 m, EI / rho of 0.0003 to 0.3 m^4/s^2.
-The true cable is a rod with twice the edges of the one that is fitted, and with eight time steps a sample, of which the
-search makes one where that is fine enough, and the estimate four. Markers have a slow error and one that is new at
+The true cable is a rod of 64 edges, with eight time steps a sample, of which the search makes one where that is fine
+enough, and the estimate four. Markers have a slow error and one that is new at
 every sample. In some recordings a gripper is struck, a marker is not seen for a while, or another point is taken for
 it.
 """
@@ -32,7 +32,7 @@ STIFFNESS, LENGTH = (0.0003, 0.3), (0.3, 3.0)
 """Ranges of EI / rho, markers included [m^4/s^2], and of the length between the clamps [m]."""
 MARKERS = 6, 9
 """Free ones: one of these numbers."""
-_TRUE, _QUICK = Rod(2 * EDGES, 8), Rod(EDGES, 2)
+_TRUE, _QUICK = Rod(64, 8), Rod(EDGES, 2)
 # The cable swings in before the recording begins, so that it does not start at rest or at a guess.
 _LEAD = 80
 _REACH = 0.028  # from a gripper's outer to its inner marker [m]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -38,12 +39,11 @@ _LOST = 1.0
 # In fits it counts for less: one lost window must not outweigh all others.
 _ROBUST = Robust(distance=0.02, lost=0.1, steepest=10.0)
 _CORRELATION = 0.3  # [s]
-# The rod that predictions are corrected by has so many edges for each of this one, and so many time steps. With more
-# than 32 edges XLA shares its small products among threads, which costs more time than the edges.
 FINER = 4
 """Time steps that estimates are corrected for, in place of each of a fit."""
-MORE_EDGES = 1.6
-"""And edges."""
+# Predictions are extrapolated from the rod's number of edges and this one, of which the next order needs one between.
+# Above 32 edges LAPACK's matrices are large enough for OpenBLAS to share among threads, which costs 20 times as much.
+_MORE_EDGES = 1.6
 # Nats per window: a step that promises less is not worth the simulations that it takes.
 _TOLERANCE = 0.1
 # Steps end by the tolerance. This is for fits that creep.
@@ -58,12 +58,14 @@ class SpatialCable(Simulator):
         rod: resolution; the material frame is followed where an explanation needs it.
         layout: of the effects.
         windows: to simulate.
+        edges: numbers of edges from whose motions that of ever more edges is extrapolated; () = the rod's alone.
         correction: added to what is predicted in the windows, see `corrected`, shape [W, T, F, 3]; None = nothing.
     """
 
     rod: Rod
     layout: Layout
     windows: Windows
+    edges: tuple[int, ...] = ()
     correction: Float[np.ndarray, "W T F 3"] | None = None
 
     @property
@@ -104,26 +106,39 @@ class SpatialCable(Simulator):
         return dataclasses.replace(self, rod=finer)
 
     def exact(self, finer: int = FINER) -> SpatialCable:
-        """The same cable with the fine edges and time steps to which estimates are corrected, without correction.
+        """The same cable with the predictions to which estimates are corrected, without correction.
+
+        Edges are straight, and their error falls with the square of their number: what two numbers predict is
+        extrapolated (Richardson 1911). Of a cable that bends over many edges a tenth of the error is left, of one that
+        hangs like a chain, or amplifies small differences, most of it; `with_next_order` shows it.
 
         Args:
             finer: so many time steps in place of each.
         """
-        # the longest local error stays the same length
-        rod = dataclasses.replace(
-            self.rod,
-            n_edges=round(MORE_EDGES * self.rod.n_edges),
-            local_error=MORE_EDGES * self.rod.local_error,
-            substeps=finer * self.rod.substeps,
-        )
-        return dataclasses.replace(self, rod=rod, correction=None)
+        rod = dataclasses.replace(self.rod, substeps=finer * self.rod.substeps)
+        return dataclasses.replace(self, rod=rod, edges=self._orders[1], correction=None)
+
+    def with_most_edges(self) -> SpatialCable:
+        """What `exact` returns, with the largest of its numbers of edges alone."""
+        return dataclasses.replace(self, edges=self._orders[0])
+
+    def with_next_order(self) -> SpatialCable:
+        """What `exact` or `with_most_edges` returns, extrapolated from one more number of edges."""
+        return dataclasses.replace(self, edges=self._orders[len(self.edges)])
+
+    @property
+    def _orders(self) -> tuple[tuple[int, ...], ...]:
+        """Numbers of edges by orders of the extrapolation."""
+        count = self.rod.n_edges
+        most, between = round(_MORE_EDGES * count), round(_MORE_EDGES**0.5 * count)
+        return (most,), (count, most), (count, between, most)
 
     def corrected(self, one: Explanation) -> SpatialCable:
-        """The cable with the predictions of a finer rod at these values, and the derivatives of this rod.
+        """The cable with the predictions of `exact` at these values, and the derivatives of this rod.
 
-        The difference of the two rods at `one` is added to every prediction. If fits are repeated, each with the
-        difference at the last result, until the values settle, the residuals are those of the finer rod, at the cost of
-        this rod's derivatives.
+        The difference of the two at `one` is added to every prediction. If fits are repeated, each with the difference
+        at the last result, until the values settle, the residuals are those of `exact`, at the cost of this rod's
+        derivatives.
         """
         plain, every = dataclasses.replace(self, correction=None), np.arange(len(self.windows))
         exact, coarse = (cable.predict([one], every)[0] for cable in (self.exact(), plain))
@@ -139,9 +154,16 @@ class SpatialCable(Simulator):
 
     def rollouts(self, one: Explanation, episodes=None) -> tuple[Float[np.ndarray, "E T F 3"], Int[np.ndarray, "E"]]:
         """The free markers of `motion`, and the `RodResult` of each window; `episodes` are windows, None = all."""
-        parts = self._in_parallel(one, np.arange(len(self.windows)) if episodes is None else episodes)
-        points, results = zip(*parts, strict=True)
-        return np.concatenate(points), np.concatenate(results)
+        episodes = np.arange(len(self.windows)) if episodes is None else episodes
+        numbers = self.edges or (self.rod.n_edges,)
+        points, results = np.zeros(()), np.zeros(len(episodes), int)
+        for number in numbers:
+            parts = self._in_parallel(self._rod_of(number), one, episodes)
+            found, ended = map(np.concatenate, zip(*parts, strict=True))
+            # of the polynomial in the squared length of an edge through all numbers, at zero
+            weight = math.prod([number**2 / (number**2 - other**2) for other in numbers if other != number])
+            points, results = points + weight * found, np.maximum(results, ended)
+        return points, results
 
     def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T F 3"]:
         """Free markers [m] at the samples that are compared; NaN from where on the simulation was not solved."""
@@ -162,7 +184,7 @@ class SpatialCable(Simulator):
     def along(
         self, one: Explanation, directions: Float[np.ndarray, "K P"], episodes: Int[np.ndarray, "E"]
     ) -> tuple[Float[np.ndarray, "E T F 3"], Float[np.ndarray, "K E T F 3"]]:
-        """Free markers [m] without correction at the samples that are compared, and their derivatives.
+        """Free markers [m] of the rod alone at the samples that are compared, and their derivatives.
 
         Args:
             one: where.
@@ -172,7 +194,7 @@ class SpatialCable(Simulator):
         count = len(directions)
         rows = np.zeros((max(_COLUMNS * -(-count // _COLUMNS), _COLUMNS), self.layout.size))
         rows[:count] = directions
-        parts = self._in_parallel(one, episodes, rows)
+        parts = self._in_parallel(self.rod, one, episodes, rows)
         predicted = np.concatenate([part[0] for part in parts])[:, FITTED]
         slopes = np.concatenate([part[1][:, :, FITTED] for part in parts])
         return predicted, np.moveaxis(slopes, 1, 0)[:count]
@@ -193,12 +215,17 @@ class SpatialCable(Simulator):
             robust=_ROBUST,
         )
 
-    def _in_parallel(self, one: Explanation, episodes, directions: Float[np.ndarray, "K P"] | None = None):
+    def _rod_of(self, n_edges: int) -> Rod:
+        """With the same longest local error, which is measured in edges."""
+        local_error = self.rod.local_error * n_edges / self.rod.n_edges
+        return dataclasses.replace(self.rod, n_edges=n_edges, local_error=local_error)
+
+    def _in_parallel(self, rod: Rod, one: Explanation, episodes, directions: Float[np.ndarray, "K P"] | None = None):
         """Batches of one size, so that one compilation serves, by as many threads as there are cores.
 
         Of each batch the free markers and the `RodResult`s, or with `directions` the markers and their derivatives.
         """
-        rod = dataclasses.replace(self.rod, twisting=TWISTED in one.names)
+        rod = dataclasses.replace(rod, twisting=TWISTED in one.names)
         simulate, differentiate = _compiled(rod, self.layout, self.windows.interval)
         run, more = (simulate, ()) if directions is None else (differentiate, (directions,))
         windows, values = self.windows.chosen(episodes), self._values(one, episodes)

@@ -26,7 +26,7 @@ from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.refits import independent
-from cablejax.spatial.cable import MORE_EDGES, TWISTED, SpatialCable
+from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.growing import beginning
 
@@ -255,8 +255,8 @@ def _rows(evidence: Evidence, fit: Fit) -> tuple[Float[np.ndarray, "R K"], Float
 def resolution(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "K"]:
     """What the error of the edges in corrected predictions does to the shared coordinates, by one Gauss-Newton step.
 
-    It falls with the square of their number, so that the difference between two numbers shows it (Richardson 1911). If
-    a cable bends over less than an edge, as next to a gripper, an estimate may rest on it.
+    The next order of the extrapolation shows it. If a cable bends over less than an edge, as next to a gripper, an
+    estimate may rest on it.
 
     Args:
         evidence: of a `SpatialCable.corrected`.
@@ -264,9 +264,9 @@ def resolution(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "K"]:
     """
     cable = evidence.simulator
     assert isinstance(cable, SpatialCable) and cable.correction is not None
-    plain = dataclasses.replace(cable, correction=None)
-    coarse, fine = (rod.predict([fit.explanation], evidence.episodes)[0] for rod in (plain, cable.exact(1)))
-    finer = dataclasses.replace(cable, correction=cable.correction + (fine - coarse) / (MORE_EDGES**2 - 1))
+    exact = cable.exact(1)
+    this, following = (rod.predict([fit.explanation], evidence.episodes)[0] for rod in (exact, exact.with_next_order()))
+    finer = dataclasses.replace(cable, correction=cable.correction + following - this)
     (there,) = evaluate(dataclasses.replace(evidence, simulator=finer), [fit.explanation])
     weight = evidence.weight(fit.sse)
     here, moved = fit.model(weight, 0.0), there.model(weight, 0.0)

@@ -16,7 +16,7 @@ from cablejax.diagnose.gap import measure_gap
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.diagnose.where import HORIZONS, Where, above, sizes_of
 from cablejax.gaplog import labels
-from cablejax.spatial.cable import MORE_EDGES, SpatialCable, bounded
+from cablejax.spatial.cable import SpatialCable, bounded
 from cablejax.spatial.growing import SHARES, early
 from cablejax.spatial.windows import Windows
 from cablejax.types import GapLog
@@ -79,7 +79,7 @@ def own_error(cable: SpatialCable, one: Explanation, motion: Float[np.ndarray, "
     """The error of a coordinate that the simulation has by itself, root mean square [m].
 
     A window begins with the shape and the velocity that its first two samples show, and noise makes both wrong: by as
-    much noise again. And the rod has edges, whose error falls with the square of their number: by fewer.
+    much noise again. And the rod has edges, whose error the next order of their extrapolation shows.
 
     Args:
         cable: with the edges of predictions.
@@ -95,10 +95,7 @@ def own_error(cable: SpatialCable, one: Explanation, motion: Float[np.ndarray, "
     points = cable.windows.keypoints.copy()
     points[:, :2] += np.random.default_rng(0).normal(0.0, noise, points[:, :2].shape)
     begun = cable.on(dataclasses.replace(cable.windows, keypoints=points))
-    coarse = dataclasses.replace(
-        cable, rod=dataclasses.replace(cable.rod, n_edges=round(cable.rod.n_edges / MORE_EDGES))
-    )
-    return float(np.hypot(off(begun), off(coarse) / (MORE_EDGES**2 - 1)))
+    return float(np.hypot(off(begun), off(cable.with_next_order())))
 
 
 def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> float:

@@ -40,7 +40,7 @@ _FINEST = 4
 # Errors of the time steps may be so large a part of what a good fit leaves, on half of the windows. The others may hold
 # a cable that snaps through, as the believed one often does where the true one is stiffer: there any error grows.
 _SHARE = 0.5
-# Time steps of predictions add so large a part of the error that is left, or less.
+# Edges and time steps of predictions add so large a part of the error that is left, or less.
 _ADDS = 0.3
 # A damping time [s] and a drag [1/s] as cables have them.
 _ORDINARY = {"bending_damping": 0.03, "viscous_drag": 0.3}
@@ -194,18 +194,18 @@ def _estimates(cable: SpatialCable, first, begun, tried, memory: Memory, progres
 
 
 def _for_predictions(cable: SpatialCable, one: Explanation) -> SpatialCable:
-    """With the edges that estimates are corrected for, and so many time steps that more change little.
+    """With so many edges and time steps that more change little.
 
-    Values that were fitted with a correction are off by what it took out where predictions have the longer steps of
-    the fit, which matters where few samples are a second.
+    Values that were fitted with a correction are off by what it took out where predictions have the longer edges and
+    steps of the fit.
     """
-    some = cable.some(_TIMED)
-    motion, seen = some.exact().motion(one), some.windows.observed
+    motion, seen = cable.some(_TIMED).exact().motion(one), cable.some(_TIMED).windows.observed
     left = np.nanmean(bounded(motion - seen)[np.isfinite(seen)] ** 2)
-    for finer in (1, 2):
-        off = bounded(some.exact(finer).motion(one) - motion)[some.windows.valid]
-        if np.mean(off**2) <= _ADDS**2 * left:
-            return cable.exact(finer)
+    for exact in (cable.exact(1), cable.exact(2), cable.exact()):
+        for choice in (exact.with_most_edges(), exact):
+            some = choice.some(_TIMED)
+            if np.mean(bounded(some.motion(one) - motion)[some.windows.valid] ** 2) <= _ADDS**2 * left:
+                return choice
     return cable.exact()
 
 
