@@ -94,7 +94,8 @@ def trial(data: str | None, name: str, seed: int) -> dict[str, Any]:
     first, candidates = drawn[:FIRST], drawn[FIRST:]
     found = identify(windows.chosen(first), believed)
     known, checked = found.everything, found.cable.on(windows.chosen(np.flatnonzero(is_eval)))
-    fitted = dataclasses.replace(found.cable, rod=Rod(EDGES, 1, twisting=False)).finer(found.time_steps.substeps)
+    plain = dataclasses.replace(found.cable, rod=Rod(EDGES, 1, twisting=False), edges=())
+    fitted = plain.finer(found.time_steps.substeps)
     gain = information(fitted.on(windows.chosen(candidates)), known)
     scored = [_score(checked, known)]
     for candidate in candidates:

@@ -76,12 +76,20 @@ def test_derivatives_are_those_of_finite_differences(cable):
     np.testing.assert_allclose(along, central, atol=1e-5 * np.abs(central).max())
 
 
-def _extrapolated(cable, one, episodes, numbers, substeps):
-    """Of the polynomial in the squared length of an edge through what rods of these numbers predict, at zero."""
+def _of_rods(cable, one, episodes, numbers, substeps):
+    """What rods of these numbers of edges predict, and the polynomial in the squared length of an edge at zero."""
     rods = [Rod(n, substeps, twisting=False, local_error=cable.rod.local_error * n / 16) for n in numbers]
     found = np.stack([dataclasses.replace(cable, rod=rod).predict([one], episodes)[0] for rod in rods])
     powers = np.vander(1 / np.square(numbers, dtype=float), increasing=True)
-    return np.linalg.solve(powers, found.reshape(len(numbers), -1))[0].reshape(found.shape[1:])
+    return found, np.linalg.solve(powers, found.reshape(len(numbers), -1))[0].reshape(found.shape[1:])
+
+
+def _extrapolated(cable, one, episodes, substeps):
+    """Less so where they are further apart than a good fit is off."""
+    (coarse, fine), limit = _of_rods(cable, one, episodes, (16, 26), substeps)
+    apart = np.linalg.norm(fine - coarse, axis=-1, keepdims=True)
+    assert np.nanmax(apart) > 1e-3
+    return fine + (limit - fine) / (1 + (apart / 0.01) ** 2)
 
 
 def test_a_corrected_cable_is_an_extrapolated_one_at_one_place_and_moves_as_before(cable):
@@ -90,7 +98,10 @@ def test_a_corrected_cable_is_an_extrapolated_one_at_one_place_and_moves_as_befo
     ((here, slopes),), ((_, plain),) = (c.linearise([one], episodes) for c in (corrected, cable))
     np.testing.assert_array_equal(slopes, plain)
     for predicted in (here, corrected.predict([one], episodes)[0]):
-        np.testing.assert_allclose(predicted, _extrapolated(cable, one, episodes, (16, 26), 4), atol=1e-12)
+        np.testing.assert_allclose(predicted, _extrapolated(cable, one, episodes, 4), atol=1e-12)
+    ((directly, also),) = cable.exact().linearise([one], episodes)
+    np.testing.assert_allclose(directly, here, atol=1e-12)
+    assert also.shape == slopes.shape
     # it says what is missing, not what was missing before, and nothing about other windows
     once, twice = corrected.correction, corrected.corrected(one).correction
     assert once is not None and twice is not None and 1e-4 < np.abs(once).max() < 0.05
@@ -198,10 +209,9 @@ def test_what_finer_edges_would_do_is_part_of_an_interval(cable):
 
     evidence, fit = fitted(corrected, at(cable))
     expected = resolution(evidence, fit)
-    this, following = (
-        _extrapolated(cable, fit.explanation, np.arange(len(cable.windows)), numbers, 1)
-        for numbers in ((16, 26), (16, 20, 26))
-    )
+    every = np.arange(len(cable.windows))
+    this = _extrapolated(cable, fit.explanation, every, 1)
+    _, following = _of_rods(cable, fit.explanation, every, (16, 20, 26), 1)
     finer = dataclasses.replace(corrected, correction=corrected.correction + following - this)
     _, again = fitted(finer, fit.explanation)
     moved = again.explanation.z - fit.explanation.z

@@ -183,7 +183,8 @@ def _finer(cable):
 def test_few_edges_are_extrapolated_to_ever_more_and_the_next_order_shows_what_is_left(fitted):
     cable, best = fitted
     exact, begun = cable.exact(), cable.windows.valid
-    motions = {name: part.motion(best) for name, part in (("this", exact), ("next", exact.with_next_order()))}
+    motions = {"this": exact.motion(best)}
+    motions |= {"next": motions["this"] + exact.left_by_edges(best)}
     # 48 edges have a quarter of the error of 26
     finer = _finer(cable).motion(best)
     motions |= {"most": exact.with_most_edges().motion(best)}

@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
-import functools
-import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -21,10 +18,10 @@ from cablejax.cores import available_cores
 from cablejax.diagnose.belief import LEAST_SQUARES
 from cablejax.diagnose.evidence import Evidence, Robust
 from cablejax.diagnose.protocol import Explanation, Plan, Simulator
-from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.accidents import moderated, trust
 from cablejax.spatial.effects import GRIP, Layout
+from cablejax.spatial.rods import compiled_rod, limit
 from cablejax.spatial.windows import FITTED, Windows
 
 GOOD_FIT = 0.01
@@ -109,8 +106,9 @@ class SpatialCable(Simulator):
         """The same cable with the predictions to which estimates are corrected, without correction.
 
         Edges are straight, and their error falls with the square of their number: what two numbers predict is
-        extrapolated (Richardson 1911). Of a cable that bends over many edges a tenth of the error is left, of one that
-        hangs like a chain, or amplifies small differences, most of it; `with_next_order` shows it.
+        extrapolated (Richardson 1911), less so where they are apart by more than a good fit leaves: a motion that
+        amplifies small differences has no limit to be reached by this. Of the error of a cable that bends over many
+        edges a tenth is left, of one that hangs like a chain most of it; `left_by_edges` shows it.
 
         Args:
             finer: so many time steps in place of each.
@@ -122,9 +120,11 @@ class SpatialCable(Simulator):
         """What `exact` returns, with the largest of its numbers of edges alone."""
         return dataclasses.replace(self, edges=self._orders[0])
 
-    def with_next_order(self) -> SpatialCable:
-        """What `exact` or `with_most_edges` returns, extrapolated from one more number of edges."""
-        return dataclasses.replace(self, edges=self._orders[len(self.edges)])
+    def left_by_edges(self, one: Explanation) -> Float[np.ndarray, "W T F 3"]:
+        """What the next order of the extrapolation would change in the motion of `exact` or `with_most_edges` [m]."""
+        numbers = self._orders[len(self.edges)]
+        each = [dataclasses.replace(self, edges=(n,)).motion(one) for n in numbers]
+        return limit(numbers, each) - self.motion(one)
 
     @property
     def _orders(self) -> tuple[tuple[int, ...], ...]:
@@ -156,14 +156,18 @@ class SpatialCable(Simulator):
         """The free markers of `motion`, and the `RodResult` of each window; `episodes` are windows, None = all."""
         episodes = np.arange(len(self.windows)) if episodes is None else episodes
         numbers = self.edges or (self.rod.n_edges,)
-        points, results = np.zeros(()), np.zeros(len(episodes), int)
-        for number in numbers:
-            parts = self._in_parallel(self._rod_of(number), one, episodes)
-            found, ended = map(np.concatenate, zip(*parts, strict=True))
-            # of the polynomial in the squared length of an edge through all numbers, at zero
-            weight = math.prod([number**2 / (number**2 - other**2) for other in numbers if other != number])
-            points, results = points + weight * found, np.maximum(results, ended)
-        return points, results
+        motions, results = zip(*(self._simulated(n, one, episodes) for n in numbers), strict=True)
+        fine = motions[-1]
+        apart = np.linalg.norm(fine - motions[0], axis=-1, keepdims=True)
+        step = (limit(numbers, motions) - fine) / (1.0 + (apart / GOOD_FIT) ** 2)
+        return fine + step, np.max(results, axis=0)
+
+    def _simulated(self, n_edges: int, one: Explanation, episodes):
+        """Free markers and `RodResult`s of a rod of so many edges, with the same longest local error in metres."""
+        rod = dataclasses.replace(
+            self.rod, n_edges=n_edges, local_error=self.rod.local_error * n_edges / self.rod.n_edges
+        )
+        return tuple(map(np.concatenate, zip(*self._in_parallel(rod, one, episodes), strict=True)))
 
     def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T F 3"]:
         """Free markers [m] at the samples that are compared; NaN from where on the simulation was not solved."""
@@ -171,12 +175,14 @@ class SpatialCable(Simulator):
         return found if self.correction is None else found + self.correction[episodes]
 
     def linearise(self, explanations, episodes):
-        """Forward derivatives, exact."""
+        """Forward derivatives: exact of the rod, which stand for those of what is predicted."""
         result = []
         for one in explanations:
             directions, own = self.directions(one)
             predicted, slopes = self.along(one, directions, episodes)
-            if self.correction is not None:
+            if self.edges:
+                predicted = self.predict([one], episodes)[0]
+            elif self.correction is not None:
                 predicted = predicted + self.correction[episodes]
             result.append((predicted, slopes[own]))
         return result
@@ -215,18 +221,13 @@ class SpatialCable(Simulator):
             robust=_ROBUST,
         )
 
-    def _rod_of(self, n_edges: int) -> Rod:
-        """With the same longest local error, which is measured in edges."""
-        local_error = self.rod.local_error * n_edges / self.rod.n_edges
-        return dataclasses.replace(self.rod, n_edges=n_edges, local_error=local_error)
-
     def _in_parallel(self, rod: Rod, one: Explanation, episodes, directions: Float[np.ndarray, "K P"] | None = None):
         """Batches of one size, so that one compilation serves, by as many threads as there are cores.
 
         Of each batch the free markers and the `RodResult`s, or with `directions` the markers and their derivatives.
         """
         rod = dataclasses.replace(rod, twisting=TWISTED in one.names)
-        simulate, differentiate = _compiled(rod, self.layout, self.windows.interval)
+        simulate, differentiate = compiled_rod(rod, self.layout, self.windows.interval)
         run, more = (simulate, ()) if directions is None else (differentiate, (directions,))
         windows, values = self.windows.chosen(episodes), self._values(one, episodes)
         # one rollout's operations are too small to share; a window alone is not worth a batch
@@ -293,31 +294,3 @@ def bounded(off: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
 def errors(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[np.ndarray, "W"]:
     """Mean absolute error of a coordinate of the free markers, from the third sample on [m]."""
     return mean_error(predicted[:, 2:], windows.observed[:, 2:])
-
-
-@functools.lru_cache(maxsize=8)
-def _compiled(rod: Rod, layout: Layout, interval: float):
-    def one(values, wanted, position, frames, seen):
-        found = rod.rollout(layout.physics(values), position, frames, seen, interval, wanted)
-        reached = jnp.arange(found.points.shape[0]) < found.solved
-        return jnp.where(reached[:, None, None], found.points, jnp.nan), found.result
-
-    def batch(values, wanted, *inputs):
-        return jax.vmap(one, (0, None, 0, 0, 0))(values, wanted, *inputs)
-
-    def both(values, directions, *inputs):
-        def tangent(direction):
-            return jax.jvp(lambda v: batch(v, *inputs)[0], (values,), (jnp.broadcast_to(direction, values.shape),))
-
-        return jax.vmap(tangent, out_axes=(None, 1))(directions)
-
-    options = compiler_options()
-    return _double(jax.jit(batch, compiler_options=options)), _double(jax.jit(both, compiler_options=options))
-
-
-def _double(run):
-    def call(*arguments):
-        with jax.enable_x64(True):
-            return run(*(jnp.asarray(np.asarray(a, float)) for a in arguments))
-
-    return call

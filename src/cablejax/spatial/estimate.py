@@ -29,6 +29,7 @@ from cablejax.diagnose.refits import independent
 from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.growing import beginning
+from cablejax.spatial.windows import FITTED
 
 # Predictions may be off by what edges and time steps of finite length do; values are not to make up for it. Fits are
 # made in rounds of at most `_STEPS` steps, predictions corrected before each, until no value moves by this share of its
@@ -264,9 +265,8 @@ def resolution(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "K"]:
     """
     cable = evidence.simulator
     assert isinstance(cable, SpatialCable) and cable.correction is not None
-    exact = cable.exact(1)
-    this, following = (rod.predict([fit.explanation], evidence.episodes)[0] for rod in (exact, exact.with_next_order()))
-    finer = dataclasses.replace(cable, correction=cable.correction + following - this)
+    left = cable.exact(1).left_by_edges(fit.explanation)[:, FITTED]
+    finer = dataclasses.replace(cable, correction=cable.correction + left)
     (there,) = evaluate(dataclasses.replace(evidence, simulator=finer), [fit.explanation])
     weight = evidence.weight(fit.sse)
     here, moved = fit.model(weight, 0.0), there.model(weight, 0.0)

@@ -88,14 +88,13 @@ def own_error(cable: SpatialCable, one: Explanation, motion: Float[np.ndarray, "
         noise: standard deviation of a coordinate [m].
     """
 
-    def off(other: SpatialCable) -> float:
-        apart = bounded(other.motion(one) - motion) ** 2
-        return float(np.sqrt(np.mean(apart[cable.windows.valid])))
+    def size(off: Float[np.ndarray, "W T F 3"]) -> float:
+        return float(np.sqrt(np.mean(bounded(off)[cable.windows.valid] ** 2)))
 
     points = cable.windows.keypoints.copy()
     points[:, :2] += np.random.default_rng(0).normal(0.0, noise, points[:, :2].shape)
     begun = cable.on(dataclasses.replace(cable.windows, keypoints=points))
-    return float(np.hypot(off(begun), off(cable.with_next_order())))
+    return float(np.hypot(size(begun.motion(one) - motion), size(cable.left_by_edges(one))))
 
 
 def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> float:
