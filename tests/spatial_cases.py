@@ -68,8 +68,8 @@ def recording(episodes: int = 4, regripped: int | None = None) -> GapLog:
     motions = [_motion(seed) for seed in range(episodes)]
     position, direction = (np.stack([m[k] for m in motions]) for k in range(2))
     frames = np.stack([frames_along(direction[:, :, q]) for q in range(2)], axis=2)
-    # shorter steps than those of the rod by which an estimate is corrected
-    rod = Rod(30, 8, twisting=False)
+    # more edges and shorter steps than those from which an estimate is corrected
+    rod = Rod(60, 8, twisting=False)
     # from hanging still, so that the first two samples are a cable at equilibrium
     still = [np.concatenate([np.repeat(a[:, :1], 60, 1), a], axis=1) for a in (position, frames)]
     line = np.linspace(0, 1, len(MARKS) + 2)[1:-1, None]
