@@ -27,7 +27,7 @@ from collections.abc import Sequence
 from typing import Any
 
 os.environ.setdefault("NPROC", "4")
-# with more threads rods of more than 32 edges take twenty times as long
+# with more threads rods of more than 32 edges take longer by far
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np

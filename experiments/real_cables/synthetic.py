@@ -2,9 +2,8 @@
 
 Cables are drawn at random from far wider ranges than the real ones span: 0.3 to 3 m, EI / rho of 0.0003 to 0.3 m^4/s^2.
 The true cable is a rod of 64 edges, with eight time steps a sample, of which the search makes one where that is fine
-enough, and the estimate four. Markers have a slow error and one that is new at
-every sample. In some recordings a gripper is struck, a marker is not seen for a while, or another point is taken for
-it.
+enough, and the estimate four. Markers have a slow error and one that is new at every sample. In some recordings a
+gripper is struck, a marker is not seen for a while, or another point is taken for it.
 """
 
 from __future__ import annotations

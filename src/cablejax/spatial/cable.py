@@ -39,7 +39,7 @@ _CORRELATION = 0.3  # [s]
 FINER = 4
 """Time steps that estimates are corrected for, in place of each of a fit."""
 # Predictions are extrapolated from the rod's number of edges and this one, of which the next order needs one between.
-# Above 32 edges LAPACK's matrices are large enough for OpenBLAS to share among threads, which costs 20 times as much.
+# Above 32 edges LAPACK's matrices are large enough for OpenBLAS to share among threads, which takes longer by far.
 _MORE_EDGES = 1.6
 # Nats per window: a step that promises less is not worth the simulations that it takes.
 _TOLERANCE = 0.1
@@ -107,8 +107,8 @@ class SpatialCable(Simulator):
 
         Edges are straight, and their error falls with the square of their number: what two numbers predict is
         extrapolated (Richardson 1911), less so where they are apart by more than a good fit leaves: a motion that
-        amplifies small differences has no limit to be reached by this. Of the error of a cable that bends over many
-        edges a tenth is left, of one that hangs like a chain most of it; `left_by_edges` shows it.
+        amplifies small differences has no limit to be reached by this. Little of the error is left where a cable bends
+        over many edges, most of it where it hangs like a chain; `left_by_edges` shows it.
 
         Args:
             finer: so many time steps in place of each.

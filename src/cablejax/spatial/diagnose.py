@@ -91,7 +91,7 @@ def diagnose_space(
         progress(change)
     noise = windows.noise
     found = identify(windows, stiffness, cable["bending_damping_s"], only=only, state=state, progress=progress)
-    effects, edges = named_effects(found, density), found.cable.edges
+    effects, edges = named_effects(found, density), max(found.cable.edges)
     named = [effect.name for effect in effects]
     before, (after, results) = found.cable.motion(explanation()), found.unseen(with_both_drags(named))
     lost, error, use = _simulated(after, windows)

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.accidents import moderated
-from cablejax.spatial.cable import GOOD_FIT, TWISTED, SpatialCable, bounded
+from cablejax.spatial.cable import FINER, GOOD_FIT, TWISTED, SpatialCable, bounded
 from cablejax.spatial.effects import Layout, effect_names, effects_of
 from cablejax.spatial.estimate import Estimate, estimate, restarts, starts_from
 from cablejax.spatial.memory import Memory, fingerprint
@@ -199,14 +199,14 @@ def _for_predictions(cable: SpatialCable, one: Explanation) -> SpatialCable:
     Values that were fitted with a correction are off by what it took out where predictions have the longer edges and
     steps of the fit.
     """
-    motion, seen = cable.some(_TIMED).exact().motion(one), cable.some(_TIMED).windows.observed
+    *choices, exact = (c for e in map(cable.exact, (1, 2, FINER)) for c in (e.with_most_edges(), e))
+    some = exact.some(_TIMED)
+    motion, seen, valid = some.motion(one), some.windows.observed, some.windows.valid
     left = np.nanmean(bounded(motion - seen)[np.isfinite(seen)] ** 2)
-    for exact in (cable.exact(1), cable.exact(2), cable.exact()):
-        for choice in (exact.with_most_edges(), exact):
-            some = choice.some(_TIMED)
-            if np.mean(bounded(some.motion(one) - motion)[some.windows.valid] ** 2) <= _ADDS**2 * left:
-                return choice
-    return cable.exact()
+    for choice in choices:
+        if np.mean(bounded(choice.on(some.windows).motion(one) - motion)[valid] ** 2) <= _ADDS**2 * left:
+            return choice
+    return exact
 
 
 def _twisted(cable: SpatialCable, steps: Sequence[Step], progress) -> list[Step]:
