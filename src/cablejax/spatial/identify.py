@@ -40,7 +40,7 @@ _FINEST = 4
 # Errors of the time steps may be so large a part of what a good fit leaves, on half of the windows. The others may hold
 # a cable that snaps through, as the believed one often does where the true one is stiffer: there any error grows.
 _SHARE = 0.5
-# Edges and time steps of predictions add so large a part of the error that is left, or less.
+# Edges and time steps of predictions change so large a part of the error that is left, or less, on half of the windows.
 _ADDS = 0.3
 # A damping time [s] and a drag [1/s] as cables have them.
 _ORDINARY = {"bending_damping": 0.03, "viscous_drag": 0.3}
@@ -202,9 +202,9 @@ def _for_predictions(cable: SpatialCable, one: Explanation) -> SpatialCable:
     *choices, exact = (c for e in map(cable.exact, (1, 2, FINER)) for c in (e.with_most_edges(), e))
     some = exact.some(_TIMED)
     motion, seen, valid = some.motion(one), some.windows.observed, some.windows.valid
-    left = np.nanmean(bounded(motion - seen)[np.isfinite(seen)] ** 2)
+    left = _typical(motion - seen, np.isfinite(seen))
     for choice in choices:
-        if np.mean(bounded(choice.on(some.windows).motion(one) - motion)[valid] ** 2) <= _ADDS**2 * left:
+        if _typical(choice.on(some.windows).motion(one) - motion, valid) <= _ADDS * left:
             return choice
     return exact
 
@@ -235,9 +235,13 @@ def time_steps_for(cable: SpatialCable) -> TimeSteps:
     substeps, coarse = 1, predicted(1)
     while True:
         fine = predicted(2 * substeps)
-        off = bounded(coarse - fine)
-        each = [part[valid].mean() for part, valid in zip(off, cable.windows.valid, strict=True)]
-        found = TimeSteps(substeps, float(np.median(each)))
+        found = TimeSteps(substeps, _typical(coarse - fine, cable.windows.valid))
         if found.fine_enough or substeps >= _FINEST:
             return found
         substeps, coarse = 2 * substeps, fine
+
+
+def _typical(off: Float[np.ndarray, "W T F 3"], counted: Bool[np.ndarray, "W *rest"]) -> float:
+    """Median over windows of the mean size of the coordinates that count [m]: few windows may amplify differences."""
+    each = [part[where] for part, where in zip(bounded(off), counted, strict=True)]
+    return float(np.median([sizes.sum() / max(sizes.size, 1) for sizes in each]))
