@@ -67,6 +67,7 @@ def test_the_rod_converges_in_nodes_and_time_step(commands):
     assert np.sqrt(np.mean((quick(WORLD, path, FRAME).points[:, ::4] - fine) ** 2)) < 2e-4
 
 
+@pytest.mark.slow
 def test_friction_holds_a_cable_at_rest(commands):
     path = commands[0].fine_path(FRAMES)[:400]
     path = np.concatenate([path, np.repeat(path[-1:], 500, axis=0)])  # ten seconds of rest

@@ -75,6 +75,7 @@ def test_what_is_there_stays_by_default(log, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
+@pytest.mark.slow
 def test_recordings_of_one_set_up_are_diagnosed_together(log, report, tmp_path, capsys):
     whole, halves = read_gap_log(log), []
     for name, rows in (("first", slice(0, 2)), ("second", slice(2, 4))):
@@ -196,6 +197,7 @@ def test_bounds_that_exclude_every_motion_are_refused(log, tmp_path, capsys):
     assert "workspace excludes" in said and "Relax the first" in said
 
 
+@pytest.mark.slow
 def test_motion_that_was_not_executed_as_commanded_is_reported(tmp_path):
     moved = record(OFFSET)
     moved.gripper_command[:, 30:60, 0, 1] += 0.02

@@ -32,6 +32,7 @@ def rubbing(friction, **changes) -> RodPlant:
     return RodPlant(dataclasses.replace(CONFIG, discretisation=cable, **changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("letter", ["U", "S", "Z"])
 def test_a_new_cable_has_the_shape_of_the_elastica(letter):
     plant = RodPlant(RodPlantConfig(discretisation=Discretisation(n_links=27, timestep=2e-4)))

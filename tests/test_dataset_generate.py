@@ -66,6 +66,7 @@ def test_what_is_known_of_a_cable_has_its_effects(tmp_path):
     np.testing.assert_array_equal(read_trajectories(tmp_path / "a.zarr", [3, 1]).cable, with_them[[3, 1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "asymmetric", "outside"),
     [

@@ -79,6 +79,7 @@ def test_without_commands_the_arms_are_not_judged():
     assert caveat(result, "No commands") and result.verdict == "none"
 
 
+@pytest.mark.slow
 def test_a_fifth_of_the_keypoints_may_be_missing():
     result = told(holed(record(OFFSET), 0.2))
     assert caveat(result, "keypoints are missing")

@@ -200,6 +200,7 @@ def test_check_refuses_a_hidden_derivative():
         check_effect(Hidden())
 
 
+@pytest.mark.slow
 def test_chain_moves_like_the_mjx_engine():
     config = Discretisation(n_links=13, timestep=0.002)
     engine = MjxEngine(config)

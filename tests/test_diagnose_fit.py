@@ -73,6 +73,7 @@ def test_known_parameters_come_back(name):
     assert abs(fit.sse.sum() - left) < 4.5 * np.sqrt(2 * left)
 
 
+@pytest.mark.slow
 def test_the_time_step_does_not_damp():
     """A light cable without friction creeps to rest after a turn of a gripper at a rate of its damping alone."""
     pose = np.tile(np.array([[0.0, 0.0, 0.6], [0.7, 0.0, -0.6]]), (1, 16, 1, 1))
@@ -322,6 +323,7 @@ def test_the_headline_lists_no_cause_whose_probability_is_below_one_per_cent():
     assert "cannot tell apart: bending stiffness or table friction." in sentence(even, 0.9)
 
 
+@pytest.mark.slow
 def test_padding_is_not_simulated_and_changes_nothing():
     """Episodes of other lengths than their arrays: the same keypoints up to their end, the last ones from there on."""
     player = playback(17)

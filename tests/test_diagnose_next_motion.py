@@ -110,6 +110,7 @@ def test_yield_shows_where_the_cable_is_bent_most():
     assert following.prior == pytest.approx(0.5) and 0.5 < following.certainty <= 1
 
 
+@pytest.mark.slow
 def test_obstacle_shows_where_the_cable_has_not_been():
     following = next_motion(judge_of(explanation(), one("obstacle", 0.42, 0.49, 0.03)))
     assert following.motion in ("shifted_repeat", "translation")
@@ -188,6 +189,7 @@ def test_designed_motion_is_worth_at_least_the_best_safe_one():
     assert interval * (len(poses) - 1) <= 25.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", ["bending_stiffness:ratio=0.4", "table_friction:coefficient=0.25"])
 def test_designed_motion_keeps_all_bounds_when_it_is_executed(effect, tmp_path):
     judge, following = designed()

@@ -21,6 +21,7 @@ def held_log(*effects) -> GapLog:
     return log_of(points + noise(points.shape, 0.5, 0), cable=ROUGH)
 
 
+@pytest.mark.slow
 def test_a_log_whose_cable_begins_elsewhere_is_read_as_held_by_the_table():
     log = held_log()
     case = Case.of(log)

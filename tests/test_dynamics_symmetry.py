@@ -72,6 +72,7 @@ def test_mirrored_and_reversed_cables_move_alike(prior, conditioned):
         np.testing.assert_allclose(backwards, moved, atol=1e-6 * size)
 
 
+@pytest.mark.slow
 def test_an_untied_network_does_not():
     config = dataclasses.replace(CONFIG, symmetric=False)
     network, history = random_network(config, seed=1), swaying_history(config)

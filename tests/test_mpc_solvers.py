@@ -109,7 +109,10 @@ def test_says_when_it_has_converged(solver):
     assert same == pytest.approx(value, rel=1e-4)
 
 
-@pytest.mark.parametrize("solver", [ProjectedGradient(max_evaluations=3), LevenbergMarquardt(max_iterations=1)])
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(ProjectedGradient(max_evaluations=3), marks=pytest.mark.slow), LevenbergMarquardt(max_iterations=1)],
+)
 def test_stops_at_its_budget_with_an_improvement(solver):
     case, guess = problem("U"), jnp.zeros((STEPS, 2, 3))
 

@@ -77,6 +77,7 @@ def test_a_second_without_a_cable_is_held_reported_and_recovered_from(tracker, m
     assert mean_error(seen.keypoints, motion[11]) < 1e-3
 
 
+@pytest.mark.slow
 def test_in_double_precision_too(tracker, motion):
     with jax.enable_x64(True):
         state, seen = tracker.init(cloud(motion[0], 1), motion[0].pose)

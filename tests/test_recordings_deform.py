@@ -176,7 +176,14 @@ def test_a_missing_gripper_pair_is_refused_and_a_missing_moment_cut(tmp_path):
 
 
 @needs_deform
-@pytest.mark.parametrize(("name", "markers", "length"), [("DLO1", 13, 1.04), ("DLO2", 12, 0.92), ("DLO3", 12, 0.98)])
+@pytest.mark.parametrize(
+    ("name", "markers", "length"),
+    [
+        pytest.param("DLO1", 13, 1.04, marks=pytest.mark.slow),
+        pytest.param("DLO2", 12, 0.92, marks=pytest.mark.slow),
+        ("DLO3", 12, 0.98),
+    ],
+)
 def test_real_recordings_are_read(name, markers, length):
     recordings = read_deform(DATA / "deform" / f"{name}.npz")
     assert isinstance(recordings, DeformRecordings)

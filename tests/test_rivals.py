@@ -76,7 +76,13 @@ def test_it_trains_like_the_graph_network(kind, tmp_path):
         train(TINY_TRAINING, trajectories(), tmp_path / "run", progress=False)
 
 
-@pytest.mark.parametrize("name", sorted(folder.name for folder in WEIGHTS.iterdir()))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(folder.name, marks=pytest.mark.slow if folder.name.startswith("lstm") else ())
+        for folder in sorted(WEIGHTS.iterdir())
+    ],
+)
 def test_kept_weights_move_a_cable(name):
     model = load_any(name)
     history = arched_history(model.config)

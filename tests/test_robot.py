@@ -94,6 +94,7 @@ class Sideways(Inwards):
         return state, np.array([[0.0, self.speed, 0.0]] * 2), None
 
 
+@pytest.mark.slow
 def test_the_referee_of_the_soak_sees_what_goes_wrong(tmp_path, monkeypatch):
     """A link without a watchdog, limits, or a log of late observations fails the soak."""
     soak = robot_soak.Soak(steps=250, links=12, seed=3, outage_every=10.0)

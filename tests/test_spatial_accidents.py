@@ -214,6 +214,7 @@ def test_what_is_not_torn_is_diagnosed():
     assert 1 not in found.gap.held_out_episodes
 
 
+@pytest.mark.slow
 def test_the_fit_to_all_begins_where_it_is_simulated_best(monkeypatch):
     windows = windows_of(cases.recording())
     cable = SpatialCable(Rod(8, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows)

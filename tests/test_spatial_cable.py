@@ -92,6 +92,7 @@ def _extrapolated(cable, one, episodes, substeps):
     return fine + (limit - fine) / (1 + (apart / 0.01) ** 2)
 
 
+@pytest.mark.slow
 def test_a_corrected_cable_is_an_extrapolated_one_at_one_place_and_moves_as_before(cable):
     one, episodes = at(cable, seed=1), np.array([0, 3])
     corrected = cable.corrected(one)
@@ -175,6 +176,7 @@ def test_elimination_solves_the_whole_system(cable):
     np.testing.assert_array_equal(moved.own[1], trial.own[1])
 
 
+@pytest.mark.slow
 def test_grips_of_every_recording_are_found_and_leave_the_stiffness_alone(cable):
     true = at(cable)
     own = 0.25 / 0.3 * np.random.default_rng(2).normal(size=(4, 4))

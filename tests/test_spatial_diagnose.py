@@ -297,6 +297,7 @@ def test_many_samples_a_second_are_averaged_and_keep_their_episodes():
     np.testing.assert_allclose(np.linalg.norm(found.gripper_pose[0, :n, :, 3:], axis=-1), 1.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_noise_in_the_beginning_of_a_window_and_few_edges_make_no_gap():
     """Half a millimetre at 50 Hz is a velocity of 2 to 4 cm/s that the cable does not have."""
     windows = windows_of(cases.recording())
@@ -401,6 +402,7 @@ def test_the_cause_is_named_from_the_windows_of_one_recording():
     assert any("only one recording" in caveat for caveat in result.caveats)
 
 
+@pytest.mark.slow
 def test_one_window_is_too_little_and_one_that_ends_at_once_is_left_out():
     log = cases.recording(1)
     with pytest.raises(ValueError, match="one window to fit"):

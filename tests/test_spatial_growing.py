@@ -37,6 +37,7 @@ def _fitted(cable, start):
     return np.concatenate(fit.explanation.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio,damping", [(0.1, 0.1), (0.3, 0.05), (0.5, 0.003), (10.0, 0.02)])
 def test_a_fit_from_afar_ends_at_the_cable(cable, ratio, damping):
     begun = beginning(cable, [_with(cable, ratio, damping)])

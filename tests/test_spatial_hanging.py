@@ -226,6 +226,7 @@ def test_derivatives_of_photographs_are_those_of_finite_differences():
     np.testing.assert_allclose(np.tensordot(direction, slopes, 1), (ahead - behind) / (2 * step), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_intervals_cover_a_softer_wire_with_a_permanent_set():
     diagnosis = diagnose_wire(photographs(5.0, 0.8))
     assert "intrinsic_curvature" in names(diagnosis)

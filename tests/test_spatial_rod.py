@@ -82,7 +82,7 @@ def _run(rod, physics, position, frames, seen):
     return np.asarray(run(physics))
 
 
-@pytest.mark.parametrize(("sideways", "twisting"), [(0.0, False), (0.15, True)])
+@pytest.mark.parametrize(("sideways", "twisting"), [pytest.param(0.0, False, marks=pytest.mark.slow), (0.15, True)])
 def test_agrees_with_the_mujoco_composite(sideways, twisting):
     config = Discretisation(
         Cable(
@@ -122,6 +122,7 @@ def test_second_order_in_the_time_step():
     assert off[1] < 1e-3
 
 
+@pytest.mark.slow
 def test_second_order_in_the_length_of_edges():
     """Of a cable of uneven stiffness that does not begin at rest: both had once made it of first order."""
     arclength = np.linspace(0.1, 0.9, 9)
@@ -135,7 +136,7 @@ def test_second_order_in_the_length_of_edges():
     assert np.abs(coarse - middle).mean() > 3.0 * np.abs(middle - fine).mean()
 
 
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_cable_clamped_on_its_rest_shape_stays(axis):
     """A cable with one bend, about the material's second or third axis, which are y and z here."""
     dense = np.linspace(0.0, 1.0, 2001)
@@ -281,7 +282,7 @@ def test_forces_of_torques_have_the_power_of_the_torques():
     np.testing.assert_allclose(jnp.vdot(force, rate), jnp.vdot(torque, spin), rtol=1e-12)
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_rod_begins_at_its_markers_however_few(count):
     """An arch with one or two markers: beyond them the clamps say where the first shape goes on."""
     opening = 1.9

@@ -202,6 +202,7 @@ def _last_samples():
     return [jax.jit(f, compiler_options=compiler_options()) for f in (last, forward, jax.grad(weighted))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [
