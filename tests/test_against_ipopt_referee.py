@@ -48,6 +48,7 @@ def ours():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_ours_and_the_referees_agree(ours, name):
     with jax.enable_x64(True):

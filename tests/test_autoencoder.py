@@ -25,6 +25,7 @@ def pretrained():
     return pretrain(TINY_TRAINING, DATA, PretrainConfig(steps=150, batch=8, lr_start=1e-2), progress=False)
 
 
+@pytest.mark.slow
 def test_auto_encoders_learn_to_reconstruct(pretrained):
     early = pretrain(TINY_TRAINING, DATA, PretrainConfig(steps=1, batch=8), progress=False)
     assert early.node_error > 0.8 and early.edge_error > 0.8

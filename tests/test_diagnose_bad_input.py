@@ -359,6 +359,7 @@ def test_two_cables_in_one_file_get_no_name_for_both():
 # Clocks.
 
 
+@pytest.mark.slow
 def test_a_second_lost_is_bridged():
     log = samples(record(OFFSET), np.delete(np.arange(SAMPLES), np.arange(50, 60)))
     result = told(log)

@@ -226,6 +226,7 @@ def assert_same(result: CableDiagnosis, other: CableDiagnosis, *, error_mm: floa
     assert result.gap.shrinkage == pytest.approx(other.gap.shrinkage, abs=0.01)
 
 
+@pytest.mark.slow
 def test_order_of_the_episodes_does_not_matter():
     order = [2, 0, 3, 1]
     result, other = diagnose(permuted(record(OFFSET), order), effects=FEW), plain(OFFSET, FEW)
@@ -257,6 +258,7 @@ def test_the_end_to_count_from_does_not_matter():
     np.testing.assert_allclose(result.where.along_cable_mm, other.where.along_cable_mm[::-1], atol=ASYMMETRY_MM)
 
 
+@pytest.mark.slow
 def test_the_frame_does_not_matter():
     result, other = diagnose(turned(record(OFFSET)), effects=FEW), plain(OFFSET, FEW)
     assert_same(result, other)

@@ -103,6 +103,7 @@ def test_the_gap_is_the_same(name, usual_mm):
     assert gap_mm(CHANGES[name](record())) == pytest.approx(usual_mm, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_short_cable_has_a_gap_where_a_long_one_has(of_size):
     def gap_over_least(size: float) -> float:
         case, calibration = of_size[size], calibrated(size)

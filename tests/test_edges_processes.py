@@ -212,6 +212,7 @@ ONLINE = "import socket; socket.create_connection(('localhost', 9))"
 COMMANDS = "import json; from cablejax.cli import main; sys.exit(max(map(main, json.loads(sys.argv[1]))))"
 
 
+@pytest.mark.slow
 def test_no_command_uses_the_network(tmp_path):
     """An audit hook, which no import can get around, ends the process at the first look-up of a name or connection."""
     table, layout = tables.written(tmp_path, tables.in_space(), tables.PAIRS)

@@ -284,6 +284,7 @@ def stubborn_cable(weights, history, twist):
     return away.at[jnp.array([0, -1])].set(twist[:, :2])
 
 
+@pytest.mark.slow
 def test_where_no_plan_helps_the_cable_is_straightened():
     control = controller("S", WITHOUT, rate=5.0, dynamics=stubborn_cable)
     cable = Cable(rate=0.8, sag=0.0, pose=[[0.0, 0.0, 0.6], [0.7, 0.1, -0.6]])

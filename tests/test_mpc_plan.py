@@ -55,6 +55,7 @@ moved = jax.jit(
 slopes = jax.jit(jax.jacfwd(lambda case, motion, x: differentiable_plan(moved(case, x), motion), argnums=2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REGIMES)
 def test_plan_is_a_minimum_and_its_derivatives_are_those_of_planning_again(name):
     """KKT residuals, then central differences of re-solves, in float64.

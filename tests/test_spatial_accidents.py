@@ -92,6 +92,7 @@ def test_a_lost_window_is_marked_and_leaves_the_others_alone(with_a_lost_window)
     assert off(errors(found, broken.windows)).tolist() == [False, True, False, False]
 
 
+@pytest.mark.slow
 def test_a_lost_window_does_not_move_a_fit(with_a_lost_window):
     whole, broken = with_a_lost_window
     one = explanation((whole.layout.named("bending_stiffness"), 0, (2.0,)))

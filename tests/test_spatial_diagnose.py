@@ -434,6 +434,7 @@ def test_too_few_samples_are_refused_before_anything_is_fitted():
     assert not any("time steps" in text for text in said)
 
 
+@pytest.mark.slow
 def test_of_one_whole_window_the_short_ones_are_used_too():
     """A recording of 8 s is one window of 5 s and one of 3 s: a search holds either out."""
     windows = windows_of(cases.recording(2))

@@ -180,6 +180,7 @@ def _finer(cable):
     return dataclasses.replace(cable, rod=Rod(48, FINER, twisting=False))
 
 
+@pytest.mark.slow
 def test_few_edges_are_extrapolated_to_ever_more_and_the_next_order_shows_what_is_left(fitted):
     cable, best = fitted
     exact, begun = cable.exact(), cable.windows.valid
