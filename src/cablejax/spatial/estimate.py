@@ -38,7 +38,8 @@ from cablejax.spatial.windows import FITTED
 _SETTLED, _ROUNDS, _STEPS, _STALLED = 0.3, 5, 4, 0.9
 # Nats per window: a step that promises less is not made.
 _TOLERANCE = 0.01
-_TAIL = 0.95
+REPORTED = 0.95
+"""Quantile at which reported intervals end."""
 # Windows that are fitted where the material frame is followed.
 _TWISTED_WINDOWS = 24
 _LARGEST_STEP = 1.0
@@ -74,7 +75,7 @@ class Interval:
 
     def wider(self, deviation: float) -> Interval:
         """The interval widened by an independent error with this standard deviation."""
-        more = norm.ppf(_TAIL) * deviation
+        more = norm.ppf(REPORTED) * deviation
         return Interval(
             self.value,
             self.value - float(np.hypot(self.value - self.low, more)),
@@ -83,7 +84,7 @@ class Interval:
 
     def among(self, count: int) -> Interval:
         """One of `count` intervals that hold all their true values in nine of ten cases (Bonferroni)."""
-        times = float(norm.ppf(1 - (1 - _TAIL) / count) / norm.ppf(_TAIL))
+        times = float(norm.ppf(1 - (1 - REPORTED) / count) / norm.ppf(REPORTED))
         low, high = self.value - times * (self.value - self.low), self.value + times * (self.high - self.value)
         return Interval(self.value, low, high)
 
@@ -129,8 +130,8 @@ class Estimate:
         with jax.enable_x64(True):
             value, slope = jax.value_and_grad(quantity)(jnp.asarray(self.shared, float))
         value, slope = float(value), np.asarray(slope)
-        left_out = t.ppf(_TAIL, len(self.moves) - 1) * np.linalg.norm(self.moves @ slope)
-        error = float(np.hypot(left_out, norm.ppf(_TAIL) * np.linalg.norm(self.shifts @ slope)))
+        left_out = t.ppf(REPORTED, len(self.moves) - 1) * np.linalg.norm(self.moves @ slope)
+        error = float(np.hypot(left_out, norm.ppf(REPORTED) * np.linalg.norm(self.shifts @ slope)))
         return Interval(value, value - error, value + error)
 
     def drawn(self, effect: str) -> float:

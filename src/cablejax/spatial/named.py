@@ -12,7 +12,7 @@ from scipy.stats import t
 
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate
 from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS
-from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval
+from cablejax.spatial.estimate import REPORTED, UNMODELLED, Estimate, Interval
 from cablejax.spatial.identify import Identified
 
 # A marker that is this near to its nominal place is not reported as displaced [m].
@@ -23,7 +23,6 @@ _HIDDEN = 0.25
 SURE = 0.95
 """An effect is named where an interval that holds its value in this share of cases leaves its absence out. By the 90 %
 that are reported too many were named that the cables to choose on of `34_fresh_cables.py` do not have."""
-_REPORTED = 0.95  # quantile at which reported intervals end
 _DRAGS = ("viscous_drag", "quadratic_drag")
 _WHOLE, _STIFFNESS, _DRAG = "bending_stiffness", "stiffness_over_density_m4_per_s2", "drag_at_speed_per_s"
 _TELLING = {
@@ -53,7 +52,7 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
     hidden = _HIDDEN * windows.interval / found.time_steps.substeps
     damping = max(float(layout.null[layout.slices["damping_time"]].item()), hidden)
     freedom = len(estimate.moves) - 1
-    wider = float(t.ppf(0.5 + 0.5 * SURE, freedom) / t.ppf(_REPORTED, freedom))
+    wider = float(t.ppf(0.5 + 0.5 * SURE, freedom) / t.ppf(REPORTED, freedom))
     # motion shows the drags' sum: it goes by the names that stayed in the search, or by that of the larger one
     drags = [name for name in found.effects if name in _DRAGS] or [_main_drag(estimate)]
     for name in dict.fromkeys((*found.effects, *found.tried)):
