@@ -29,6 +29,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from scipy.stats import norm
 
+from cablejax.cable import GRAVITY
 from cablejax.recordings.deform import SAMPLE_INTERVAL, repaired_blocks
 from cablejax.spatial.cable import errors
 from cablejax.spatial.identify import identify
@@ -43,8 +44,8 @@ from rows import Rows, made_on
 
 HELD_OUT = range(1640, 1680)
 """Seeds of the page: nothing is chosen on these cables."""
-NARROW = range(1480, 1520)
-"""Nor on these, which an earlier generator drew from a narrower range, without accidents."""
+EARLIER = range(1480, 1520)
+"""Nor on these, of an earlier page, which were drawn from a narrower range, without accidents."""
 TRIALS = Path("docs") / "results" / "trials" / "fresh_cables.jsonl"
 LAWS: tuple[tuple[Law, str], ...] = (("richer", "the rod"), ("composite", "MuJoCo"))
 """The two simulators, and their names on the page."""
@@ -56,6 +57,8 @@ LEVELS = (0.9, SURE)
 """Of the intervals that are reported, and of those by which an effect is named."""
 NEAR = 0.1
 """Ratio beyond one by which EI / rho of the two halves may differ."""
+BENDS = (3.0, 20.0)
+"""Caveats are about shorter and longer cables, in lengths over which they bend under their own weight."""
 DRAGS = ("viscous_drag", "quadratic_drag")
 EI, DRAG = "stiffness_over_density_m4_per_s2", "drag_at_speed_per_s"
 """Quantities that are reported of every cable, by their names in a verdict."""
@@ -195,8 +198,7 @@ def presence(row: dict[str, Any], effect: str) -> str:
     """Whether an effect is there, and moves the markers far enough to be judged."""
     if effect not in row["present"]:
         return "not there"
-    # the narrower ones, whose rows do not say it, had effects of a size that shows
-    return "shows" if row.get("moved_mm", {}).get(effect, math.inf) >= 1e3 * SHOWS else "hidden"
+    return "shows" if row["moved_mm"][effect] >= 1e3 * SHOWS else "hidden"
 
 
 def missed_in(row: dict[str, Any]) -> list[str]:
@@ -228,31 +230,36 @@ def bias(rows: list[dict[str, Any]]) -> str:
     return f"{100 * off.mean():+.1f} ± {100 * error:.1f} %"
 
 
-def narrow_section(rows: list[dict[str, Any]]) -> list[str]:
-    """What was found on the cables of `NARROW`."""
-    near = share([max(row["halves"]) / min(row["halves"]) - 1 <= NEAR for row in rows])
-    return [
-        "## Cables of 0.85 to 1 m",
-        "",
-        f"The {len(rows)} cables of seeds {NARROW[0]} to {NARROW[-1]} are of an earlier generator and of earlier fits: "
-        "0.85 to 1 m, EI/rho of 0.009 to 0.2 m^4/s^2, damping of 0.01 to 0.1 s, 16 recordings of 1 s, no accidents. "
-        "All effects that are there show. No command makes these rows again.",
-        "",
-        *named_table(rows),
-        "",
-        *interval_table(rows),
-        "",
-        f"EI/rho from the two halves of the recordings is within {100 * NEAR:.0f} % on {near[0]} cables, {near[1]}.",
-        "",
-    ]
+def by_bends(rows: list[dict[str, Any]]) -> list[str]:
+    """The same figures for cables that bend over much of their length, over little of it, and between."""
+    few, many = BENDS
+    groups = {f"less than {few:g}": (0.0, few), f"{few:g} to {many:g}": BENDS, f"more than {many:g}": (many, math.inf)}
+    table = [["bending lengths", "cables", "named where it shows", "named though not there"]]
+    table[0] += ["intervals that hold the true value", f"halves within {100 * NEAR:.0f} %"]
+    for word, (least, most) in groups.items():
+        of = [row for row in rows if least <= row["length_m"] / (row[EI] / GRAVITY) ** (1 / 3) < most]
+        named = {how: [] for how in ("shows", "hidden", "not there")}
+        for row in of:
+            for effect in EFFECTS:
+                named[presence(row, effect)].append(effect in named_in(row["effects"]))
+        held = [low <= true <= high for row in of for true, _, low, high in row["reported"].values()]
+        counted = (named["shows"], named["not there"], held, [halves_apart(row) <= NEAR for row in of])
+        table.append([word, str(len(of)), *(f"{sum(one)} of {len(one)}" for one in counted)])
+    return markdown_table(table)
 
 
-def page(rows: list[dict[str, Any]], narrow: list[dict[str, Any]], made: str) -> str:
-    """The page of these cables."""
+def halves_apart(row: dict[str, Any]) -> float:
+    """Ratio of EI / rho from the two halves of the recordings, beyond one."""
+    return max(row["halves"]) / min(row["halves"]) - 1
+
+
+def page(rows: list[dict[str, Any]], every: list[dict[str, Any]], made: str) -> str:
+    """The page of these cables, with the windows lost of every one that was ever done."""
     broken = sum("broken" in row for row in rows)
     rows = sorted((row for row in rows if "broken" not in row), key=lambda row: row["seed"])
-    ratio = [max(row["halves"]) / min(row["halves"]) - 1 for row in rows]
+    ratio = [halves_apart(row) for row in rows]
     windows, lost = np.sum([row["windows"] for row in rows], axis=0)
+    windows_of_all, lost_of_all = np.sum([row["windows"] for row in every if "broken" not in row], axis=0)
     lines = [
         f"{len(rows)} of the {len(HELD_OUT)} cables of seeds {HELD_OUT[0]} to {HELD_OUT[-1]} ({broken} left out, "
         f"because their recordings could not be simulated, {len(HELD_OUT) - broken - len(rows)} not done), "
@@ -295,12 +302,21 @@ def page(rows: list[dict[str, Any]], narrow: list[dict[str, Any]], made: str) ->
         + " (± standard error).",
         "",
         f"EI/rho from the two halves of the recordings is within {100 * NEAR:.0f} % on {near[0]} cables, {near[1]}. "
-        f"Windows lost or off by ten times the median: {lost} of {windows}. A cable takes "
+        f"Windows lost or off by ten times the median: {lost} of {windows}, and {lost_of_all} of {windows_of_all} on "
+        f"all {len(every)} cables that are kept, those of earlier fits included. A cable takes "
         f"{np.median([row['seconds'] for row in rows]):.0f} s (median, its simulation and the estimates of the halves "
         f"included). All effects together reduce the median error on unseen recordings from "
         "{:.1f} to {:.1f} mm.".format(*np.median([row["error_mm"] for row in rows], axis=0)),
         "",
-        *narrow_section(narrow),
+        "## Long and short cables",
+        "",
+        "Cables by how many times longer they are than the length over which they bend under their own weight, "
+        "(EI/(rho g))^(1/3). The weight of a cable of less than "
+        f"{BENDS[0]:g} says little of its stiffness, and one of more than {BENDS[1]:g} hangs like a chain; the "
+        "diagnosis has a caveat for either.",
+        "",
+        *by_bends(rows),
+        "",
         "## Every cable",
         "",
         *markdown_table(
@@ -340,13 +356,14 @@ def main() -> None:
     options = parser.parse_args()
     rows = Rows(options.trials, ("seed",))
     if options.report:
-        done, narrow = ([row for row in rows.read() if row["seed"] in seeds] for seeds in (HELD_OUT, NARROW))
+        every = rows.read()
+        done = [row for row in every if row["seed"] in HELD_OUT]
         if all("broken" in row for row in done):
             raise SystemExit(f"{options.trials} has no finished cable of the seeds {HELD_OUT.start}:{HELD_OUT.stop}.")
-        publish(page(done, narrow, made_on(options.trials)), options.report)
+        publish(page(done, every, made_on(options.trials)), options.report)
         return
     if options.calibrate:
-        held_out = {*HELD_OUT, *NARROW}
+        held_out = {*HELD_OUT, *EARLIER}
         chosen_on = [row for row in rows.read() if row["seed"] not in held_out and "broken" not in row]
         print("\n".join(calibration(chosen_on)))
         return
