@@ -119,7 +119,7 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
             *map(float, np.ravel(known[name].value)),
             *map(float, np.ravel(np.array(known[name].ci90))),
         ]
-    predicted, _ = found.unseen()
+    (nominal, _), (predicted, _) = found.unseen(()), found.unseen()
     unseen = errors_of(predicted, windows)
     return {
         "law": law_of(seed),
@@ -140,7 +140,7 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
         "halves": [half.stiffness.value for half in found.halves],
         "windows": [unseen.windows, unseen.off],
         # without any effect, and with all
-        "error_mm": [1e3 * float(each.mean()) for each in (found.steps[0].error, errors(predicted, windows))],
+        "error_mm": [1e3 * float(each.mean()) for each in (errors(nominal, windows), errors(predicted, windows))],
         "steps": [[s.effect, s.accepted, s.chance, 1e3 * float(s.error.mean())] for s in found.steps],
         "seconds": time.perf_counter() - begun,
     }

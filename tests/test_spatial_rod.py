@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -309,3 +312,54 @@ def test_a_rod_begins_at_its_markers_however_few(count):
         physics, np.broadcast_to(place(s[[0, -1]]), (3, 2, 3)), frames, seen, _INTERVAL
     )
     np.testing.assert_allclose(found.points[0], seen[0], atol=3e-3)
+
+
+@pytest.fixture(scope="module")
+def swung():
+    """A cable that is shaken, from the middle of its motion on: poses, six markers with gaps, and its true markers."""
+    arclength, count, begin = np.linspace(0.12, 0.88, 6), 150, 60
+    time = _INTERVAL * np.arange(count)
+    swing = np.stack([0 * time, 0.05 * np.sin(9 * time), 0.04 * np.sin(13 * time)], axis=1)
+    position = np.stack([swing, np.array([0.6, 0.0, 0.0]) - swing], axis=1)
+    down = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    frames = np.broadcast_to(np.stack([down, down * np.array([-1.0, 1.0, -1.0])[:, None]]), (count, 2, 3, 3))
+    sag = np.stack([0.6 * arclength, 0 * arclength, -0.4 * np.sin(np.pi * arclength)], axis=1)
+    with jax.enable_x64(True):
+        physics = _physics(arclength, damping_time=0.01, stiffness=np.full(1, 0.02))
+        true = _run(Rod(40, 4, twisting=False), physics, position, frames, np.stack([sag, sag]))[begin:]
+    shown = true[:12].copy()
+    shown[3:6, 2] = np.nan
+    return physics, position[begin:], frames[begin:], shown, true
+
+
+def test_a_rod_that_was_shown_more_of_a_motion_goes_on_closer_to_it(swung):
+    physics, position, frames, shown, true = swung
+    rod = Rod(40, 4, twisting=False)
+    two, more = (_run(rod, physics, position, frames, shown[:count]) for count in (2, 12))
+    off = [np.linalg.norm(found - true, axis=2) for found in (two, more)]
+    assert np.nanmax(off[1][[2, *range(8, 12)]]) < 5e-4
+    assert np.median(off[1][20:]) < 0.3 * np.median(off[0][20:])
+
+
+@pytest.mark.parametrize("twisting", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_derivatives_of_a_rod_that_is_shown_a_motion(swung, twisting):
+    physics, position, frames, shown, _ = swung
+    rod, count, lost = Rod(12, twisting=twisting), 16, np.isnan(shown)
+    stiffer = jax.tree.map(jnp.zeros_like, physics)
+    stiffer = dataclasses.replace(stiffer, stiffness=0.1 * physics.stiffness, offset=0.002 + physics.offset)
+    shifted = 1e-3 * np.random.default_rng(0).standard_normal(shown.shape)
+
+    def last(scale):
+        changed = jax.tree.map(lambda leaf, d: leaf + scale * d, physics, stiffer)
+        seen = jnp.where(lost, jnp.nan, shown + scale * shifted)
+        return rod.rollout(changed, position[:count], frames[:count], seen, _INTERVAL).points[-1]
+
+    compiled = functools.partial(jax.jit, compiler_options=compiler_options())
+    run, zero, step = compiled(last), jnp.zeros(()), 1e-3
+    forward = compiled(lambda s: jax.jvp(last, (s,), (jnp.ones(()),))[1])(zero)
+    difference = (run(zero + step) - run(zero - step)) / (2 * step)
+    assert np.abs(difference).max() > 1e-4
+    np.testing.assert_allclose(forward, difference, atol=1e-4 * float(np.abs(difference).max()))
+    cotangent = np.random.default_rng(1).standard_normal(forward.shape)
+    pulled = compiled(lambda s: jax.vjp(last, s)[1](jnp.asarray(cotangent))[0])(zero)
+    np.testing.assert_allclose(pulled, np.sum(cotangent * forward), rtol=1e-8)

@@ -110,14 +110,16 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
         networks = [chosen, *networks]
         without_own = errors_of(on_kept.motion(shared_only(everything)), kept)
 
-    stages, share = [], train.keypoints.shape[2] / train.n_keypoints
+    stages = []
     for step in found.steps:
         if step.accepted:
             name = f"+ {step.effect}" if step.effect else "nominal"
             scored = None
             if kept is not None:
                 scored = float(np.mean([errors_of(found.cable.on(kept).motion(h), kept).mean for h in step.halves]))
-            stages.append((name, 1e3 * share * float(moderated(step.error).mean()), scored))
+            one, other = (found.cable.motion(half) for half in step.halves)
+            unseen = np.where(found.first[:, None, None, None], other, one)
+            stages.append((name, errors_of(unseen, train).mean, scored))
     learned = []
     for name in _LEARNED:
         scored, spread = None, None

@@ -197,7 +197,7 @@ def _by_recording(scores: Mapping[str, Any], learned: Sequence[str], best: int) 
     rows = [
         ["", *scores],
         _row(
-            "nominal simulator: length from the markers, textbook EI/rho, no damping, no drag (windows of the search)",
+            "nominal simulator: length from the markers, textbook EI/rho, no damping, no drag",
             pick(lambda s: s["stages"][0][1], "{:.1f}"),
         ),
         *_unsimulated_rows(scores, 1),
@@ -275,7 +275,7 @@ def _step_by_step(scores: Mapping[str, Any]) -> list[str]:
     lines = [
         "## Step by step",
         "",
-        "Unseen: windows of the search, from the half of the recordings that the fit has not seen. Eval: the same "
+        "Unseen: from the half of the recordings that the fit has not seen. Eval: the same "
         "step, mean over the fits to either half.",
         "",
     ]

@@ -56,6 +56,7 @@ class SpatialCable(Simulator):
         layout: of the effects.
         windows: to simulate.
         edges: numbers of edges from whose motions that of ever more edges is extrapolated; () = the rod's alone.
+        shown: so many samples of each window the simulation is given, see `Rod.rollout`.
         correction: added to what is predicted in the windows, see `corrected`, shape [W, T, F, 3]; None = nothing.
     """
 
@@ -63,6 +64,7 @@ class SpatialCable(Simulator):
     layout: Layout
     windows: Windows
     edges: tuple[int, ...] = ()
+    shown: int = 2
     correction: Float[np.ndarray, "W T F 3"] | None = None
 
     @property
@@ -239,7 +241,7 @@ class SpatialCable(Simulator):
             part = windows.chosen(full)
             # up to the last sample that is recorded in one of them
             wanted = 1 + np.flatnonzero(part.valid.any(axis=0))[-1]
-            found = run(values[full], *more, wanted, part.position, part.frames, part.keypoints[:, :2])
+            found = run(values[full], *more, wanted, part.position, part.frames, part.observed[:, : self.shown])
             return jax.tree.map(lambda a: np.asarray(a)[: len(index)], found)
 
         with concurrent.futures.ThreadPoolExecutor(available_cores()) as pool:

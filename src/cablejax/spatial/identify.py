@@ -14,6 +14,7 @@ damping.
 from __future__ import annotations
 
 import dataclasses
+import math
 import pathlib
 from collections.abc import Callable, Collection, Sequence
 
@@ -37,6 +38,9 @@ _TIMED = 8
 _RIVAL = "stiffness_profile"
 # Of the time steps between two samples, at most.
 _FINEST = 4
+# For so long the simulated cable follows its markers in fits [s]: two samples of a few markers leave its motion between
+# them open, and what that adds later hides small effects. Predictions begin with two samples.
+_SHOWN = 0.1
 # Errors of the time steps may be so large a part of what a good fit leaves, on half of the windows. The others may hold
 # a cable that snaps through, as the believed one often does where the true one is stiffer: there any error grows.
 _SHARE = 0.5
@@ -147,7 +151,7 @@ def identify(
         f"time steps of {1e3 * windows.interval / time_steps.substeps:.3g} ms; half of that changes the motion by "
         f"{1e3 * time_steps.error:.1f} mm"
     )
-    cable = cable.finer(time_steps.substeps)
+    cable = dataclasses.replace(cable.finer(time_steps.substeps), shown=2 + math.ceil(_SHOWN / windows.interval))
     picked = cable.some(_SEARCHED)
     memory = Memory(state, fingerprint(cable, names), layout)
     steps = search(
@@ -169,7 +173,7 @@ def identify(
     first = halves(windows.group)
     one, other, everything = _estimates(cable, first, last.halves, names, memory, progress)
     return Identified(
-        cable=_for_predictions(cable, everything.explanation),
+        cable=_for_predictions(dataclasses.replace(cable, shown=2), everything.explanation),
         time_steps=time_steps,
         effects=tuple(name for name in accepted_effects(steps) if name in last.halves[0].names),
         tried=tuple(names),

@@ -24,10 +24,9 @@ from cablejax.whole_file import whole_file
 def fingerprint(cable: SpatialCable, names: Sequence[str]) -> str:
     """Inputs that a stored state must have been made from."""
     layout, windows = cable.layout, cable.windows
+    simulated = (cable.rod, cable.exact().edges, cable.shown)
     digest = hashlib.sha256(
-        repr(
-            (cable.rod, cable.exact().edges, layout.nominal_stiffness, list(names), windows.name, layout.effects)
-        ).encode()
+        repr((*simulated, layout.nominal_stiffness, list(names), windows.name, layout.effects)).encode()
     )
     # what coordinates and values mean is among the inputs: those of another version may mean something else
     meaning = [np.asarray(part, np.float32) for part in jax.tree.leaves(layout.physics(layout.null + 0.5))]

@@ -26,6 +26,8 @@ from cablejax.simulate.rod.physics import RodPhysics
 
 # Pull of an observed marker on the first shape, over the mass of a length of cable [m/s^2 per m].
 _PIN = 1.5e3
+# The same on a moving cable, which follows its markers within 5 ms, for the cable from one marker to the next.
+_FOLLOWS = 4e4
 
 
 def along_joints(values: Float[Array | np.ndarray, "J"], count: int) -> Float[Array, "count"]:
@@ -173,10 +175,24 @@ class DiscreteRod:
             held: the first two and the last two nodes [m].
             guess: free nodes to start from [m]; no derivative passes through it.
         """
-        root, n = jnp.sqrt(_PIN / self.h), self.n
-        pins = root * self.weights
-        pinned = ElasticChain(jnp.zeros(n - 4), self.bending, self.h, self.compliance, pins[:, 2:-2])
-        at_ends = pins[:, :2] @ held[:2] + pins[:, -2:] @ held[2:]
-        pull = pins[:, 2:-2].T @ (root * markers - at_ends) + self.physics.gravity
-        free, _, error = constrained(True, pinned, pull, held, *jax.lax.stop_gradient((guess, jnp.zeros(n - 3))))
+        n = self.n
+        pins, pull = self._pulled(markers, held, jnp.sqrt(_PIN / self.h))
+        pinned = ElasticChain(jnp.zeros(n - 4), self.bending, self.h, self.compliance, pins)
+        force = pull + self.physics.gravity
+        free, _, error = constrained(True, pinned, force, held, *jax.lax.stop_gradient((guess, jnp.zeros(n - 3))))
         return with_held(free, held), error <= TOLERANCE
+
+    def following(
+        self, markers: Float[Array, "N 3"], held: Float[Array, "4 3"]
+    ) -> tuple[Float[Array, "N f"], Float[Array, "f 3"]]:
+        """Pins and forces with which observed markers pull a moving cable towards themselves; NaN = not observed."""
+        seen = jnp.isfinite(markers).all(axis=1, keepdims=True)
+        spacing = self.physics.length / (len(markers) + 1)
+        root = jnp.where(seen, jnp.sqrt(_FOLLOWS * spacing / self.h), 0.0)
+        return self._pulled(jnp.where(seen, markers, 0.0), held, root)
+
+    def _pulled(self, markers: Float[Array, "N 3"], held: Float[Array, "4 3"], root):
+        """Pins to markers, with these roots of their strengths, and what they add to the forces on the free nodes."""
+        pins = root * self.weights
+        at_ends = pins[:, :2] @ held[:2] + pins[:, -2:] @ held[2:]
+        return pins[:, 2:-2], pins[:, 2:-2].T @ (root * markers - at_ends)

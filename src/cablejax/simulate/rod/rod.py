@@ -107,11 +107,14 @@ class Rod:
         physics: RodPhysics,
         position: Float[Array | np.ndarray, "T 2 3"],
         frames: Float[Array | np.ndarray, "T 2 3 3"],
-        seen: Float[Array | np.ndarray, "2 N 3"],
+        seen: Float[Array | np.ndarray, "K N 3"],
         interval: Float[Array, ""] | float,
         wanted: Int[Array, ""] | int | None = None,
     ) -> Rollout:
         """Free markers at every sample; the first two are fits to `seen`, all others follow from the motion.
+
+        Two samples of a few markers hardly tell how a cable moves between them. Further ones pull the cable towards
+        themselves for as long as they last, which brings the motion after them close to the observed one.
 
         Differentiable in all arguments, in forward and in reverse mode, where the result is not `UNSOLVED`; the lengths
         of time steps are chosen without derivative.
@@ -120,7 +123,7 @@ class Rod:
             physics: of this cable.
             position: of the grippers [m].
             frames: of the grippers, rows are axes in the world, the first along the cable.
-            seen: free markers at the first two samples [m].
+            seen: free markers at the first K samples [m], at least two; from the third on NaN = not observed.
             interval: between samples [s].
             wanted: so many samples are simulated, and the cable stays as it is at the last; None = all.
         """
@@ -132,10 +135,10 @@ class Rod:
         start = _Progress(motion, zero, zero + _WHOLE, ~found, jnp.zeros((), bool), zero)
 
         def sample(progress, inputs):
-            window, go = inputs
+            window, marks, go = inputs
 
             def step(progress, index):
-                return self._march(discrete, interval, progress, window, index), None
+                return self._march(discrete, interval, progress, (window, marks), index), None
 
             def advanced(progress):
                 return jax.lax.scan(step, progress, jnp.arange(self.substeps))[0]
@@ -146,9 +149,12 @@ class Rod:
                 points = points + discrete.marker_offsets(progress.motion.directors, progress.motion.tangents)
             return progress, (points, progress.lost)
 
-        grippers = _windows(jnp.concatenate([held, side], axis=1))
+        grippers, shown = _windows(jnp.concatenate([held, side], axis=1)), None
+        if len(seen) > 2:
+            padded = jnp.full((len(position), *seen.shape[1:]), jnp.nan).at[: len(seen)].set(seen)
+            shown = jnp.stack([padded[1:-1], padded[2:]], axis=1)
         go = jnp.arange(2, len(position)) < (len(position) if wanted is None else wanted)
-        progress, (points, lost) = jax.lax.scan(sample, start, (grippers, go))
+        progress, (points, lost) = jax.lax.scan(sample, start, (grippers, shown, go))
         result = jnp.where(progress.lost, RodResult.UNSOLVED, jnp.where(progress.coarse, RodResult.COARSE, 0))
         solved = jnp.where(found, 2 + jnp.sum(~lost), 0)
         return Rollout(jnp.concatenate([first_points, points]), result, solved, progress.attempts)
@@ -192,21 +198,24 @@ class Rod:
             found & also,
         )
 
-    def _march(self, discrete: DiscreteRod, interval, progress: _Progress, window, index) -> _Progress:
+    def _march(self, discrete: DiscreteRod, interval, progress: _Progress, between, index) -> _Progress:
         """Makes the time step of this index between two samples, in parts of 1, 1/2, ... 1/32 of it.
 
         A part that is not solved, or has too large a local error, is tried again with shorter ones; after one that was
         easy the next is twice as long.
         """
-        dt = interval / self.substeps
+        dt, (window, shown) = interval / self.substeps, between
 
         def attempt(at: _Progress) -> _Progress:
             share = (index + (at.done + at.size) / _WHOLE) / self.substeps
             grippers, rates = _between(window, share)
             ends, side = grippers[:4], grippers[4:]
             roll_rate = _roll_rate(ends, side, rates[4:] / interval)
+            markers = None if shown is None else shown[0] + share * (shown[1] - shown[0])
+            if markers is not None and self.twisting:
+                markers = markers - discrete.marker_offsets(at.motion.directors, at.motion.tangents)
             new, solved, error = time_step(
-                discrete, at.motion, dt * at.size / _WHOLE, ends, side, roll_rate, twisting=self.twisting
+                discrete, at.motion, dt * at.size / _WHOLE, ends, side, roll_rate, markers, twisting=self.twisting
             )
             ratio = jax.lax.stop_gradient(error / discrete.h) / self.local_error
             fine, shortest = solved & (ratio <= 1.0), at.size == 1

@@ -54,6 +54,7 @@ def time_step(
     ends: Float[Array, "4 3"],
     side: Float[Array, "2 3"],
     roll_rate: Float[Array, "2"],
+    markers: Float[Array, "N 3"] | None = None,
     *,
     twisting: bool,
 ) -> tuple[Motion, Bool[Array, ""], Float[Array, ""]]:
@@ -70,6 +71,7 @@ def time_step(
         ends: the held nodes after the step [m].
         side: the held edges' directors after the step.
         roll_rate: of the held edges about themselves after the step [rad/s].
+        markers: that pull the cable towards themselves [m], NaN = not observed; None = there are none.
         twisting: whether the material frame is followed.
     """
     physics, bending, mass = discrete.physics, discrete.bending, discrete.mass
@@ -95,12 +97,16 @@ def time_step(
     )
     if twisting:
         force = force + discrete.forces(x_next, transport(u, t, unit(edges)), unit(edges))
+    pins = jnp.zeros((0, discrete.n - 4))
+    if markers is not None:
+        pins, pull = discrete.following(markers, ends)
+        force = force + pull
     chain = ElasticChain(
         weight=lead**2 * mass[:, 0] + lead * drag[:, 0],
         bending=(1.0 + _IMPLICIT * lead * physics.damping_time) * bending,
         edge=discrete.h,
         compliance=discrete.compliance,
-        pins=jnp.zeros((0, discrete.n - 4)),
+        pins=pins,
     )
     guess = x + dt * v + 0.5 * dt * w * (v - v_old)
     free, pulled, error = constrained(
