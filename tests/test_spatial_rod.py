@@ -332,6 +332,13 @@ def swung():
     return physics, position[begin:], frames[begin:], shown, true
 
 
+@pytest.mark.parametrize("count", [1, 13])
+def test_too_few_and_too_many_samples_are_refused(swung, count):
+    physics, position, frames, shown, _ = swung
+    with pytest.raises(ValueError, match=rf"{count} samples of the markers, expected 2 to 12"):
+        Rod().rollout(physics, position[:12], frames[:12], np.resize(shown, (count, *shown.shape[1:])), _INTERVAL)
+
+
 def test_a_rod_that_was_shown_more_of_a_motion_goes_on_closer_to_it(swung):
     physics, position, frames, shown, true = swung
     rod = Rod(40, 4, twisting=False)

@@ -78,7 +78,7 @@ class ElasticChain:
         bending: of each joint, shape [J].
         edge: h, length of an edge [m].
         compliance: eps.
-        pins: P, rows that tie free nodes to what was observed, shape [m, f]; none in a time step.
+        pins: P, rows that tie free nodes to what is observed, shape [m, f]; none in a time step that is shown nothing.
     """
 
     weight: Float[Array | np.ndarray, "f"]

@@ -126,7 +126,12 @@ class Rod:
             seen: free markers at the first K samples [m], at least two; from the third on NaN = not observed.
             interval: between samples [s].
             wanted: so many samples are simulated, and the cable stays as it is at the last; None = all.
+
+        Raises:
+            ValueError: fewer than two samples of the markers, or more than of the grippers.
         """
+        if not 2 <= len(seen) <= len(position):
+            raise ValueError(f"{len(seen)} samples of the markers, expected 2 to {len(position)}, as of the grippers.")
         position, frames, seen = jnp.asarray(position), jnp.asarray(frames), jnp.asarray(seen)
         discrete = DiscreteRod.of(jax.tree.map(jnp.asarray, physics), self.n_edges)
         held, side = held_nodes(discrete.physics, position, frames, discrete.h)
