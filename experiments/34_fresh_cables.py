@@ -19,6 +19,7 @@ import functools
 import math
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ from scipy.stats import norm
 from cablejax.cable import GRAVITY
 from cablejax.recordings.deform import SAMPLE_INTERVAL, repaired_blocks
 from cablejax.spatial.cable import errors
-from cablejax.spatial.identify import identify
+from cablejax.spatial.caveats import STIFF
+from cablejax.spatial.identify import EDGES, identify
 from cablejax.spatial.named import SURE, named_effects, quantities_of
 from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish, share
@@ -57,7 +59,7 @@ LEVELS = (0.9, SURE)
 """Of the intervals that are reported, and of those by which an effect is named."""
 NEAR = 0.1
 """Ratio beyond one by which EI / rho of the two halves may differ."""
-BENDS = (3.0, 20.0)
+BENDS = (STIFF, float(EDGES))
 """Caveats are about shorter and longer cables, in lengths over which they bend under their own weight."""
 DRAGS = ("viscous_drag", "quadratic_drag")
 EI, DRAG = "stiffness_over_density_m4_per_s2", "drag_at_speed_per_s"
@@ -182,16 +184,19 @@ def calibration(rows: list[dict[str, Any]]) -> list[str]:
 def named_table(rows: list[dict[str, Any]]) -> list[str]:
     """Effects that are there and named, and that are named though they are not there."""
     table = [["effect", "named where it shows", "share", "named where it is hidden", "named though not there", "share"]]
-    every: dict[str, list[bool]] = {"shows": [], "hidden": [], "not there": []}
-    for effect in EFFECTS:
-        named = {how: [] for how in every}
-        for row in rows:
-            named[presence(row, effect)].append(effect in named_in(row["effects"]))
-        table.append([effect, *_shares(named)])
-        for how, of in named.items():
-            every[how].extend(of)
-    table.append(["all", *_shares(every)])
+    for word, effects in (*((effect, [effect]) for effect in EFFECTS), ("all", EFFECTS)):
+        shows, hidden, absent = named_where(rows, effects)
+        table.append([word, *share(shows), f"{sum(hidden)} of {len(hidden)}", *share(absent)])
     return markdown_table(table)
+
+
+def named_where(rows: list[dict[str, Any]], effects: Sequence[str]) -> tuple[list[bool], list[bool], list[bool]]:
+    """Whether each effect of each cable is named: where it shows, where it is hidden, and where it is not there."""
+    named = {"shows": [], "hidden": [], "not there": []}
+    for row in rows:
+        for effect in effects:
+            named[presence(row, effect)].append(effect in named_in(row["effects"]))
+    return named["shows"], named["hidden"], named["not there"]
 
 
 def presence(row: dict[str, Any], effect: str) -> str:
@@ -205,11 +210,6 @@ def presence(row: dict[str, Any], effect: str) -> str:
 def missed_in(row: dict[str, Any]) -> list[str]:
     """Effects that show and are not named."""
     return [e for e in EFFECTS if presence(row, e) == "shows" and e not in named_in(row["effects"])]
-
-
-def _shares(named: dict[str, list[bool]]) -> list[str]:
-    hidden = named["hidden"]
-    return [*share(named["shows"]), f"{sum(hidden)} of {len(hidden)}", *share(named["not there"])]
 
 
 def interval_table(rows: list[dict[str, Any]]) -> list[str]:
@@ -239,12 +239,9 @@ def by_bends(rows: list[dict[str, Any]]) -> list[str]:
     table[0] += ["intervals that hold the true value", f"halves within {100 * NEAR:.0f} %"]
     for word, (least, most) in groups.items():
         of = [row for row in rows if least <= row["length_m"] / (row[EI] / GRAVITY) ** (1 / 3) < most]
-        named = {how: [] for how in ("shows", "hidden", "not there")}
-        for row in of:
-            for effect in EFFECTS:
-                named[presence(row, effect)].append(effect in named_in(row["effects"]))
+        shows, _, absent = named_where(of, EFFECTS)
         held = [low <= true <= high for row in of for true, _, low, high in row["reported"].values()]
-        counted = (named["shows"], named["not there"], held, [halves_apart(row) <= NEAR for row in of])
+        counted = (shows, absent, held, [halves_apart(row) <= NEAR for row in of])
         table.append([word, str(len(of)), *(f"{sum(one)} of {len(one)}" for one in counted)])
     return markdown_table(table)
 

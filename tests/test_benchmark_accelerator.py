@@ -78,7 +78,9 @@ def test_energy_is_counted_or_absent():
     assert (first is None and second is None) or 0 <= first <= second
 
 
-@pytest.mark.parametrize("name", [pytest.param("MJX", marks=pytest.mark.slow), "chain"])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "MJX" else ()) for name in ENGINES]
+)
 def test_an_engine_asks_for_full_precision(name):
     # On a GPU JAX multiplies matrices in TF32 unless it is asked not to.
     function, arguments, steps = ENGINES[name](Discretisation(n_links=6), 3, 1)

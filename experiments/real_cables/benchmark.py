@@ -117,9 +117,7 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
             scored = None
             if kept is not None:
                 scored = float(np.mean([errors_of(found.cable.on(kept).motion(h), kept).mean for h in step.halves]))
-            one, other = (found.cable.motion(half) for half in step.halves)
-            unseen = np.where(found.first[:, None, None, None], other, one)
-            stages.append((name, errors_of(unseen, train).mean, scored))
+            stages.append((name, errors_of(found.unseen_by(*step.halves)[0], train).mean, scored))
     learned = []
     for name in _LEARNED:
         scored, spread = None, None

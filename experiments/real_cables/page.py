@@ -275,8 +275,8 @@ def _step_by_step(scores: Mapping[str, Any]) -> list[str]:
     lines = [
         "## Step by step",
         "",
-        "Unseen: from the half of the recordings that the fit has not seen. Eval: the same "
-        "step, mean over the fits to either half.",
+        "Unseen: from the half of the recordings that the fit has not seen. Eval: the same step, mean over the fits to "
+        "either half.",
         "",
     ]
     for cable, score in scores.items():

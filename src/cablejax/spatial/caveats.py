@@ -12,7 +12,7 @@ from cablejax.spatial.gap import OWN
 from cablejax.spatial.identify import EDGES, Identified
 from cablejax.spatial.windows import Windows
 
-_STIFF = 3.0
+STIFF = 3.0
 """A cable that is not so many times longer than the length over which it bends is held up by its grippers."""
 
 
@@ -111,7 +111,7 @@ def _on_fits(windows: Windows, found: Identified) -> list[str]:
     why = ""
     if bends < length / EDGES:
         why = "less than an edge of the simulated cable, so its bending hardly shows"
-    elif bends > length / _STIFF:
+    elif bends > length / STIFF:
         why = (
             "more than a third of its length, so its weight says little of the stiffness, and twist and markers off "
             "the centreline, which are not simulated, weigh more"

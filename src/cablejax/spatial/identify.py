@@ -103,9 +103,15 @@ class Identified:
         Args:
             effects: that are simulated, with their values from the fit of all; None = all.
         """
-        ones = [half.explanation if effects is None else half.with_only(effects) for half in self.halves]
-        (one, ended), (other, other_ended) = map(self.cable.rollouts, ones)
-        return np.where(self.first[:, None, None, None], other, one), np.where(self.first, other_ended, ended)
+        ones = (half.explanation if effects is None else half.with_only(effects) for half in self.halves)
+        return self.unseen_by(*ones)
+
+    def unseen_by(
+        self, one: Explanation, other: Explanation
+    ) -> tuple[Float[np.ndarray, "W T F 3"], Int[np.ndarray, "W"]]:
+        """What `unseen` returns, of other fits to the first half of the recordings and to the second."""
+        (found, ended), (others, others_ended) = map(self.cable.rollouts, (one, other))
+        return np.where(self.first[:, None, None, None], others, found), np.where(self.first, others_ended, ended)
 
 
 def layout_of(windows: Windows, nominal_stiffness: float, nominal_damping: float = 0.0) -> Layout:

@@ -140,10 +140,10 @@ class Rod:
         start = _Progress(motion, zero, zero + _WHOLE, ~found, jnp.zeros((), bool), zero)
 
         def sample(progress, inputs):
-            window, marks, go = inputs
+            between, go = inputs
 
             def step(progress, index):
-                return self._march(discrete, interval, progress, (window, marks), index), None
+                return self._march(discrete, interval, progress, between, index), None
 
             def advanced(progress):
                 return jax.lax.scan(step, progress, jnp.arange(self.substeps))[0]
@@ -159,7 +159,7 @@ class Rod:
             padded = jnp.full((len(position), *seen.shape[1:]), jnp.nan).at[: len(seen)].set(seen)
             shown = jnp.stack([padded[1:-1], padded[2:]], axis=1)
         go = jnp.arange(2, len(position)) < (len(position) if wanted is None else wanted)
-        progress, (points, lost) = jax.lax.scan(sample, start, (grippers, shown, go))
+        progress, (points, lost) = jax.lax.scan(sample, start, ((grippers, shown), go))
         result = jnp.where(progress.lost, RodResult.UNSOLVED, jnp.where(progress.coarse, RodResult.COARSE, 0))
         solved = jnp.where(found, 2 + jnp.sum(~lost), 0)
         return Rollout(jnp.concatenate([first_points, points]), result, solved, progress.attempts)
@@ -207,7 +207,7 @@ class Rod:
         """Makes the time step of this index between two samples, in parts of 1, 1/2, ... 1/32 of it.
 
         A part that is not solved, or has too large a local error, is tried again with shorter ones; after one that was
-        easy the next is twice as long.
+        easy the next is twice as long. `between` has the grippers about these samples, and the markers at both or None.
         """
         dt, (window, shown) = interval / self.substeps, between
 
@@ -217,8 +217,6 @@ class Rod:
             ends, side = grippers[:4], grippers[4:]
             roll_rate = _roll_rate(ends, side, rates[4:] / interval)
             markers = None if shown is None else shown[0] + share * (shown[1] - shown[0])
-            if markers is not None and self.twisting:
-                markers = markers - discrete.marker_offsets(at.motion.directors, at.motion.tangents)
             new, solved, error = time_step(
                 discrete, at.motion, dt * at.size / _WHOLE, ends, side, roll_rate, markers, twisting=self.twisting
             )

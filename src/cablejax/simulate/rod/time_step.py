@@ -99,7 +99,8 @@ def time_step(
         force = force + discrete.forces(x_next, transport(u, t, unit(edges)), unit(edges))
     pins = jnp.zeros((0, discrete.n - 4))
     if markers is not None:
-        pins, pull = discrete.following(markers, ends)
+        offsets = discrete.marker_offsets(u, t) if twisting else 0.0
+        pins, pull = discrete.following(markers - offsets, ends)
         force = force + pull
     chain = ElasticChain(
         weight=lead**2 * mass[:, 0] + lead * drag[:, 0],
