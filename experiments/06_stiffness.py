@@ -1,4 +1,4 @@
-"""Table III of Wang et al., RA-L 2022: U, S and Z by cables of 0.1 to 3 times the trained stiffness, by every method.
+"""Table III of Wang et al., RA-L 2022: U, S and Z by cables of 0.1 to 3 times the usual stiffness, by every method.
 
 python experiments/06_stiffness.py                    # one seed, three methods, one stiffness: some minutes
 python experiments/06_stiffness.py --full             # all of it, hours on two cores; resumable
@@ -28,7 +28,7 @@ if __name__ == "__main__":
             title="U, S and Z by cables of other stiffness",
             about=(
                 "The plant is C MuJoCo in space with contact and friction cones, its cable of 24 links 0.1 to 3 times "
-                "as stiff as the trained one. Every trial starts from a straight cable whose heading, place and "
+                "as stiff as the reference cable. Every trial starts from a straight cable whose heading, place and "
                 "slack depend on the seed; a cell is the mean over stiffnesses and seeds. A run ends after 60 "
                 f"commands, or after {PATIENCE} in which the error does not change. The settling time is the time "
                 "after which the error stays near its last value: within a tenth of that value, or of the error's "

@@ -1,7 +1,7 @@
 """Compares planning horizons and solvers in closed loop: error against milliseconds of a control call.
 
-Every pair of a horizon (1, 2, 5, 10) and a solver brings a straight cable, twice as stiff as the trained one, to U, S
-and Z on the plant in C MuJoCo, with the online residual; everything else is the controller's default.
+Every pair of a horizon (1, 2, 5, 10) and a solver brings a straight cable, twice as stiff as the reference cable, to U,
+S and Z on the plant in C MuJoCo, with the online residual; everything else is the controller's default.
 
     python experiments/12_horizon_and_solver.py --shapes U --horizons 5      # a part of it: some minutes
     python experiments/12_horizon_and_solver.py                              # all of it: an hour on two idle cores
@@ -137,8 +137,8 @@ def draw(table: dict, path: Path) -> None:
 def page(trials: list[Trial], table: dict, picture: str | None, made: str) -> str:
     """The Markdown page."""
     lines = [
-        f"{len(trials)} closed loops: a straight cable, {STIFFNESS:g} times as stiff as the trained one, brought to "
-        f"{', '.join(sorted({t.shape for t in trials}))} by {STEPS} commands on the contact plant; seeds "
+        f"{len(trials)} closed loops: a straight cable, {STIFFNESS:g} times as stiff as the reference cable, brought "
+        f"to {', '.join(sorted({t.shape for t in trials}))} by {STEPS} commands on the contact plant; seeds "
         f"{', '.join(map(str, sorted({t.seed for t in trials})))}; gns-reference with the online residual. A horizon h "
         "plans h + 1 commands. Milliseconds are those of a control call in the loop, while other work was running on "
         "this machine: compare rows, and see [speed](speed.md) for the default alone. Means of a few runs support "

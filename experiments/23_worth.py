@@ -1,13 +1,13 @@
 """Measures what a diagnosis is worth: informs the model of the named cause, and shapes the cable again.
 
-    python experiments/23_worth.py --out runs/worth     # with a learner first, seed by seed; resumable
+    python experiments/23_worth.py --out runs/worth     # seed by seed; resumable
     python experiments/23_worth.py --out runs/worth --report docs/results/worth.md
 
 The plant is MuJoCo in space with contact, and has an effect that the model does not know. The target is the resting
 shape of the plant's cable in a letter's gripper poses, as if a person had shown it. Six runs without a learner, 180 s
 in all, are the log. The model of every arm but the last is `gns-conditioned`, which estimates stiffness and friction
-online; the arms differ by what the model was informed of (`cablejax shape --with verdict.json`), and by the online
-learner:
+online. All have the online learner; they differ by what the model was informed of (`cablejax shape --with
+verdict.json`):
 
 - `plain`: nothing;
 - `diagnosed`: what the verdict on the log names, where that enters a model;
@@ -79,28 +79,11 @@ NEAR = 0.5
 SETTLING = 8
 """Times that a letter is brought nearer to rest: more change it by less than a micrometre."""
 ONLINE = " + learner"
+"""Ends the names of the arms in their trials."""
 MODEL = "gns-conditioned"
-
-
-def arm(name: str) -> MethodSpec:
-    """The method of an arm."""
-    learner = STATIC if name.endswith(ONLINE) else None
-    return MethodSpec(name, MODEL, learner=learner, fine_tuned=not name.startswith("plain"))
-
-
 ARMS = tuple(
-    map(
-        arm,
-        (
-            f"plain{ONLINE}",
-            f"diagnosed{ONLINE}",
-            f"oracle{ONLINE}",
-            f"recorded{ONLINE}",
-            "plain",
-            "diagnosed",
-            "oracle",
-        ),
-    )
+    MethodSpec(f"{kind}{ONLINE}", MODEL, learner=STATIC, fine_tuned=kind != "plain")
+    for kind in ("plain", "diagnosed", "oracle", "recorded")
 )
 
 
@@ -114,13 +97,11 @@ def main() -> None:
     if options.report is not None:
         publish(page(options.out), options.report)
         return
-    with_learner = [spec for spec in ARMS if spec.learner]
-    without = [spec for spec in ARMS if not spec.learner]
-    trials, groups = options.out / "trials", itertools.product((with_learner, without), (EFFECTS, LEARNED))
+    trials = options.out / "trials"
     with executor_of(options.executor) as executor:
-        for arms, effects in groups:
+        for effects in (EFFECTS, LEARNED):
             for seed, text in itertools.product(SEEDS[: options.seeds], effects):
-                for spec in arms:
+                for spec in ARMS:
                     model = functools.partial(model_for, text, spec.name.removesuffix(ONLINE), options.out / slug(text))
                     own = cases(text, [seed])
                     run_suite(own, [spec], trials, fine_tuned=model, executor=executor, progress=False)
@@ -222,8 +203,9 @@ def page(out: pathlib.Path) -> str:
     lines = [
         "The plant has an effect that the model does not know. The target is the resting shape of the plant's cable "
         "in a letter's gripper poses, as if shown by hand. A verdict on "
-        f"six runs ({6 * COMMANDS} s, 1 mm noise, seeds {', '.join(map(str, LOG_SEEDS))}) informs the model; "
-        f"*recorded* is trained on the same six runs instead. {len(seeds)} seeds.",
+        f"six runs ({6 * COMMANDS} s, 1 mm noise, seeds {', '.join(map(str, LOG_SEEDS))}) informs the model "
+        "of the arm *diagnosed*. That of *plain* is informed of nothing, that of *oracle* of the true effect, and that "
+        f"of *recorded* is trained on the same six runs instead. All learn online. {len(seeds)} seeds.",
         "",
     ]
     for title, measure in MEASURES.items():
@@ -233,7 +215,7 @@ def page(out: pathlib.Path) -> str:
             "",
             "Mean, standard deviation, count.",
             "",
-            *markdown_table([["effect", "letter", *(spec.name for spec in ARMS)], *table]),
+            *markdown_table([["effect", "letter", *(spec.name.removesuffix(ONLINE) for spec in ARMS)], *table]),
             "",
             "Paired differences; negative: the first is nearer or sooner. Mean difference, 95 % interval over seeds, "
             "runs better / worse. The share is of the oracle's gain, if the gain's interval excludes 0.",
@@ -241,12 +223,7 @@ def page(out: pathlib.Path) -> str:
             *markdown_table(
                 [
                     PAIRED_HEAD,
-                    *(
-                        row
-                        for suffix in (ONLINE, "")
-                        for text in (*EFFECTS, *LEARNED)
-                        if (row := paired_row(trials, text, suffix, measure, out))
-                    ),
+                    *(row for text in (*EFFECTS, *LEARNED) if (row := paired_row(trials, text, measure, out))),
                 ]
             ),
             "",
@@ -259,7 +236,6 @@ def page(out: pathlib.Path) -> str:
 PAIRED_HEAD = (
     "effect",
     "named",
-    "learner",
     "diagnosed less plain",
     "oracle less plain",
     "share",
@@ -318,11 +294,11 @@ def cell(values: Values) -> str:
 
 
 def paired_row(
-    trials: Sequence[Trial], text: str, suffix: str, measure: Callable[[Trial], float], out: pathlib.Path
+    trials: Sequence[Trial], text: str, measure: Callable[[Trial], float], out: pathlib.Path
 ) -> tuple[str, ...] | None:
     """One effect's row of paired differences; None before its arms have run."""
     plain, diagnosed, oracle, recorded = (
-        measured(trials, text, f"{kind}{suffix}", measure) for kind in ("plain", "diagnosed", "oracle", "recorded")
+        measured(trials, text, f"{kind}{ONLINE}", measure) for kind in ("plain", "diagnosed", "oracle", "recorded")
     )
     if not (plain and diagnosed and oracle):
         return None
@@ -330,7 +306,6 @@ def paired_row(
     return (
         f"`{text}`",
         ", ".join(f"`{effect}`" for effect in effects_of_verdict(out / slug(text) / VERDICT)),
-        "yes" if suffix else "no",
         difference_text(ours),
         difference_text(best),
         f"{100 * ours.mean / best.mean:.0f} %" if best.interval.high < 0 else "no gain",

@@ -6,6 +6,9 @@ import re
 import numpy as np
 import pytest
 
+from cablejax.effects.given import EFFECTS, parameter_units
+from cablejax.simulate import ENGINES
+
 PAGES = pathlib.Path(__file__).parents[1] / "docs" / "concepts"
 COMPILE = pytest.mark.slow
 
@@ -21,6 +24,21 @@ def example(page: str) -> dict:
 def test_simulate(capsys):
     assert example("simulate.md")["trajectory"].keypoints.shape == (6, 13, 2)
     assert capsys.readouterr().out
+
+
+def test_the_table_of_effects_is_that_of_the_library():
+    page = (PAGES / "simulate.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in row.strip("|").split("|")] for row in page.splitlines() if row.startswith("| `")]
+    said = {name.strip("`"): (set(re.findall(r"`(\w+)`", taken)), hook, there) for name, taken, _, hook, there in rows}
+    engines = {"chain": "chain", "mjx": "MJX", "threaded": "C"}
+    assert said == {
+        name: (
+            set(parameter_units(effect)),
+            effect.hook,
+            ", ".join(word for engine, word in engines.items() if effect.hook in ENGINES[engine].hooks),
+        )
+        for name, effect in EFFECTS.items()
+    }
 
 
 def test_plants(capsys):

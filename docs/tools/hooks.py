@@ -68,7 +68,7 @@ def _arrows(mermaid: str) -> str:
     for left, right in re.findall(r"^\s*(\w+)\s*-->\s*(\w+)$", mermaid, re.MULTILINE):
         above.setdefault(left, []).append(right)
     rows = [f"| `{left}` | {', '.join(f'`{name}`' for name in right)} |" for left, right in above.items()]
-    return "\n".join(["| room | may import |", "| --- | --- |", *rows, ""])
+    return "\n".join(["| subpackage | may import |", "| --- | --- |", *rows, ""])
 
 
 def on_page_content(content: str, **_: Any) -> str:

@@ -131,13 +131,13 @@ def fine_tuned_model(folder: pathlib.Path, case: Case) -> Model:
 
 def page(experiment: Experiment, trials: Sequence[Trial], command: str, made: str, picture: str | None) -> str:
     """The Markdown page of an experiment's trials."""
-    lines = [experiment.about]
+    lines = [experiment.about, "", tables.methods_table(trials)]
     for table in experiment.tables:
         mine = [trial for trial in trials if trial.table == table]
         if not mine:
             continue
         if table == NEARBY:
-            ratios = f"{NEARBY_RATIOS[0]:g} to {NEARBY_RATIOS[-1]:g} times as stiff as the trained cable"
+            ratios = f"{NEARBY_RATIOS[0]:g} to {NEARBY_RATIOS[-1]:g} times as stiff as the reference cable"
             about = f"Z from one start, {ratios}; mean error of the last {LATE} s."
             lines += ["", "## Ten plants next to one another", "", about, ""]
             lines += [interval_tables.nearby_table(mine, table)]

@@ -83,6 +83,15 @@ METHODS: dict[str, MethodSpec] = {
 in any case."""
 
 
+LEARNERS: dict[LearnerConfig | None, str] = {
+    None: "",
+    PAPER: "`residual.PAPER`, the paper's ridge",
+    STATIC: "`residual.STATIC`, the learner for a model that expects the cable to relax",
+    LearnerConfig(): "`residual.LearnerConfig()`, the learner",
+}
+"""What corrects a model online, for readers."""
+
+
 @functools.lru_cache(maxsize=8)
 def model_named(name: str) -> Model:
     """A released model, one of `experiments/weights`, a training's folder, or the statics; loaded once."""

@@ -6,7 +6,7 @@ many trials each method was run.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import cast
 
 from closed_loop.cells import (
@@ -23,11 +23,23 @@ from closed_loop.cells import (
     trial_count,
     trials_of_table,
 )
+from closed_loop.methods import LEARNERS, METHODS
 from closed_loop.paper import PAPER, PaperTable, best_in_paper
 from closed_loop.trials import Trial
 
 STEP_BANDS = (0.05, 0.02)
 """Bands of the settling time of a step response, as fractions of the way that the error went."""
+
+
+def methods_table(trials: Sequence[Trial]) -> str:
+    """The model of every method of these trials, and what corrects it online."""
+    rows = []
+    for spec in (METHODS[method] for method in methods_of(trials)):
+        model = "none" if spec.weights is None else f"`{spec.weights}`"
+        rows.append(
+            [label_of(spec.name), model + ", fine-tuned on this cable" * spec.fine_tuned, LEARNERS[spec.learner]]
+        )
+    return markdown(["method", "model", "corrected online by"], rows).rstrip()
 
 
 def comparison_table(trials: Iterable[Trial], table: str) -> str:

@@ -123,7 +123,7 @@ def page(scores: Mapping[str, Any], published: Published, picture: str, made: st
         "",
         *_by_recording(scores, learned, best),
         "",
-        "Bold: the best one, over all cables.",
+        "Bold, in both tables: the best one by recording, over all cables.",
         "",
         f"![Error of every step]({picture})",
         "",
