@@ -18,7 +18,7 @@ from cablejax.spatial.diagnose import diagnose_space
 from cablejax.spatial.estimate import starts_from
 from cablejax.spatial.growing import beginning
 from cablejax.spatial.identify import layout_of
-from cablejax.spatial.search import Step, falls, search
+from cablejax.spatial.search import Step, falls, halves, search
 from cablejax.spatial.windows import windows_of
 
 _GROUP = np.repeat(np.arange(6), 4)
@@ -64,12 +64,12 @@ def test_the_budget_of_failures_counts_what_could_be_judged(monkeypatch, counts)
     names = [effect.name for effect in cable.effects[:6]]
     null = explanation()
     begun = [Step("", True, (null, null), np.full(len(windows), 0.01), 0.0)]
-    monkeypatch.setattr("cablejax.spatial.search._starts", lambda cable, halves, effect: ((null, null), 0.0))
+    monkeypatch.setattr("cablejax.spatial.search._starts", lambda cable, first, halves, effect: ((null, null), 0.0))
     monkeypatch.setattr(
         "cablejax.spatial.search.tried_with",
-        lambda cable, name, starts, before, progress: Step(name, False, (null, null), before.error, 0.0, counts),
+        lambda cable, first, name, starts, before, progress: Step(name, False, (null, null), before.error, 0.0, counts),
     )
-    assert len(search(cable, names, begun=begun)) == 1 + (4 if counts else 6)
+    assert len(search(cable, halves(windows.group), names, begun=begun)) == 1 + (4 if counts else 6)
 
 
 @pytest.fixture(scope="module")
@@ -242,7 +242,7 @@ def test_a_fit_that_does_not_settle_ends_and_says_so(monkeypatch):
     cable = SpatialCable(Rod(8, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows)
     start = explanation((cable.layout.named("bending_stiffness"), 0, (cases.TRUE_RATIO,)))
     (fit,) = evaluate(cable.evidence(), [start])
-    error = np.hypot(*(np.linalg.norm(rows) for rows in estimates._rows(cable.evidence(), fit)))
+    error = np.hypot(*(np.linalg.norm(rows) for rows in estimates.sources(cable.evidence(), fit)))
     rounds = []
     monkeypatch.setattr(estimates, "beginning", lambda cable, starts: starts[0])
 

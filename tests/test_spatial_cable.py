@@ -14,10 +14,11 @@ from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
-from cablejax.spatial.estimate import Estimate, estimate_at, jackknife, resolution, starts_from
+from cablejax.spatial.estimate import Estimate, estimate_at, starts_from
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.memory import Memory
 from cablejax.spatial.search import Step
+from cablejax.spatial.uncertainty import jackknife, resolution
 from cablejax.spatial.windows import windows_of
 
 _EFFECTS = ("bending_stiffness", "bending_damping", "gripper_rotation_offset")

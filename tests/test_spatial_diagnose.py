@@ -26,7 +26,7 @@ from cablejax.spatial.diagnose import _equivalent, _ranking, diagnose_space
 from cablejax.spatial.estimate import Estimate
 from cablejax.spatial.gap import OWN, in_log, is_gap, own_error, smallest_gap, where_of, with_gap
 from cablejax.spatial.geometry import local_changes
-from cablejax.spatial.identify import TWISTED, Identified, _twisted, layout_of
+from cablejax.spatial.identify import TWISTED, Identified, _searched, _twisted, layout_of
 from cablejax.spatial.named import _damped
 from cablejax.spatial.search import Step, falls, halves
 from cablejax.spatial.windows import windows_of
@@ -154,7 +154,7 @@ def test_rest_curvature_is_tried_in_place_of_its_look_alike_too(monkeypatch, bet
         return Step(name, True, starts, share * before.error, 0.9, instead_of=instead_of)
 
     monkeypatch.setattr("cablejax.spatial.identify.tried_with", tried)
-    steps += _twisted(cable, steps, lambda text: None)
+    steps += _twisted(cable, halves(cable.recording), steps, lambda text: None)
     assert [(step.effect, step.accepted) for step in steps[2:]] == [(TWISTED, False), (TWISTED, True)]
     assert steps[-1].instead_of == better
     assert steps[-1].halves[0].names == ((TWISTED,) if better else (profile.name, TWISTED))
@@ -439,9 +439,16 @@ def test_of_one_whole_window_the_short_ones_are_used_too():
     """A recording of 8 s is one window of 5 s and one of 3 s: a search holds either out."""
     windows = windows_of(cases.recording(2))
     short = dataclasses.replace(windows, valid=windows.valid & (np.arange(100) < [[100], [60]]))
-    assert short.whole(24).tolist() == [0, 1]
-    first = halves(short.chosen(short.whole(24)).group)
-    assert first.any() and not first.all()
+    assert short.whole(24).tolist() == _searched(short, halves(short.group)).tolist() == [0, 1]
+
+
+def test_the_search_sees_windows_of_both_halves():
+    windows = windows_of(cases.recording())
+    many = windows.chosen(np.repeat(np.arange(len(windows)), 10))
+    many = dataclasses.replace(many, group=np.repeat([0, 1, 2, 3, 4], [12, 11, 9, 6, 2])[: len(many)])
+    first = halves(many.group)
+    seen = _searched(many, first)
+    assert len(seen) == len(set(seen)) == 24 and (np.diff(seen) > 0).all() and first[seen].sum() == 12
 
 
 def test_a_recording_at_another_rate_is_sampled_again():

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
+from scipy.stats import t
 
 import spatial_cases as cases
-from cablejax.diagnose.fit import evaluate, improve
+from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import FINER, TWISTED, SpatialCable
 from cablejax.spatial.caveats import caveats
-from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, restarts
+from cablejax.spatial.effects import effects_of
+from cablejax.spatial.estimate import REPORTED, UNMODELLED, Interval, estimate, restarts
 from cablejax.spatial.identify import Identified, TimeSteps, _for_predictions, layout_of
 from cablejax.spatial.named import named_effects, parameters_of, quantities_of, with_both_drags
+from cablejax.spatial.uncertainty import jackknife
 from cablejax.spatial.windows import windows_of
 
 _FOUND = ("bending_stiffness", "bending_damping")
@@ -344,9 +349,44 @@ def test_drag_and_mass_may_be_zero_and_not_less(everything):
 
 def test_many_intervals_hold_together(everything):
     one = Interval(1.0, 0.0, 3.0)
-    assert one.among(1) == one
-    five = one.among(5)
+    assert one.among(1, 7) == one
+    five = one.among(5, 10**6)
     assert (five.high - 1.0) / 2.0 == pytest.approx(1.0 - five.low) == pytest.approx(2.326 / 1.645, rel=1e-3)
+    # of the means of four recordings each, all five hold in nine of ten cases
+    random = np.random.default_rng(0).normal(size=(4000, 4, 5))
+    mean, error = random.mean(axis=1), t.ppf(REPORTED, 3) * random.std(axis=1, ddof=1) / 2
+    wider = Interval(0.0, -1.0, 1.0).among(5, 3).high
+    assert 0.9 <= (np.abs(mean) < wider * error).all(axis=1).mean() < 0.94
+
+
+def test_a_value_at_its_bound_leaves_the_others_as_uncertain_as_they_are():
+    stiffness, drag = (e for e in effects_of(6, 0.0) if e.name in ("bending_stiffness", "viscous_drag"))
+    random, count = np.random.default_rng(1), 8
+    slopes = random.normal(size=(count, 40, 2))
+    # by itself the drag would be far below 0; recordings differ in stiffness
+    seen = slopes @ [0.5, -3.0] + slopes[..., 0] * random.normal(0.0, 0.5, (count, 1)) + random.normal(size=(count, 40))
+
+    def best(use):
+        design = np.vstack([slopes[use].reshape(-1, 2), np.eye(2)])
+        return lsq_linear(design, np.append(seen[use], [0.0, 0.0]), ([-np.inf, 0.0], np.inf), tol=1e-14).x
+
+    every = np.ones(count, bool)
+    one = explanation((stiffness, 0, (1.0,)), (drag, 0, (0.0,))).moved(best(every))
+    off = slopes @ one.z - seen
+    squares = np.einsum("emp,emq->epq", slopes, slopes)
+    fit = Fit(one, (off**2).sum(axis=1), np.einsum("emp,em->ep", slopes, off), squares)
+    evidence = types.SimpleNamespace(
+        simulator=types.SimpleNamespace(recording=np.arange(count)),
+        episodes=np.arange(count),
+        weight=lambda sse: np.ones(len(sse)),
+    )
+    left_out = np.array([best(np.arange(count) != k) for k in range(count)]) - one.z
+    exact = np.sqrt((count - 1) / count * (left_out**2).sum(axis=0))
+    error = np.linalg.norm(jackknife(evidence, fit), axis=0)  # type: ignore[arg-type]
+    assert np.abs(one.z[1]) < 1e-12 and exact[1] < 1e-12
+    assert error[0] == pytest.approx(exact[0], rel=0.01)
+    # that it cannot be lower does not make it certain
+    assert error[1] > 0.01
 
 
 def test_a_mass_is_told_per_density(everything):

@@ -14,7 +14,7 @@ from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable, typical_error
 from cablejax.spatial.growing import beginning
 from cablejax.spatial.identify import layout_of
-from cablejax.spatial.search import accepted_effects, search
+from cablejax.spatial.search import accepted_effects, halves, search
 
 _FOUND = ("bending_stiffness", "bending_damping")
 
@@ -68,7 +68,7 @@ def test_windows_too_short_to_have_beginnings_are_fitted_as_they_are(cable):
 def test_what_explains_a_soft_cable_is_tried_before_what_calms_it_down(cable):
     true = explanation((cable.layout.named("bending_stiffness"), 0, (0.02,)))
     soft = cable.on(dataclasses.replace(cable.windows, keypoints=cable.motion(true)))
-    steps = search(soft, ["viscous_drag", "bending_stiffness"])
+    steps = search(soft, halves(soft.recording), ["viscous_drag", "bending_stiffness"])
     assert steps[1].effect == "bending_stiffness"
     assert accepted_effects(steps) == ["bending_stiffness"]
 

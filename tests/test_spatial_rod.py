@@ -332,6 +332,30 @@ def swung():
     return physics, position[begin:], frames[begin:], shown, true
 
 
+@pytest.mark.parametrize(
+    ("twisting", "changes"),
+    [
+        (False, {"marker_mass": 0.3}),
+        pytest.param(True, {"rest_curvature": np.array([[0.0, 0.0], [1.5, 3.0], [0.0, 0.0]])}, marks=pytest.mark.slow),
+    ],
+)
+def test_a_cable_that_rests_begins_at_rest(twisting, changes):
+    arclength = np.linspace(0.0, 1.0, 8)[1:-1]
+    physics = _physics(arclength, stiffness=np.full(1, 0.01), damping_time=0.2, drag=5.0, **changes)
+    position = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]])
+    frames = np.array([Rotation.from_euler("y", angle).as_matrix().T for angle in (0.9, -0.9)])
+
+    def run(seen, physics, samples):
+        moving = [np.repeat(part[None], samples, axis=0) for part in (position, frames)]
+        return _run(Rod(20, 2, twisting=twisting), physics, *moving, np.stack([seen, seen]))
+
+    sagging = np.stack([0.6 * arclength, 0.0 * arclength, -0.35 * np.sin(np.pi * arclength)], axis=1)
+    rest = run(sagging, physics, 1200)[-1]
+    assert np.linalg.norm(rest - sagging, axis=1).max() > 0.01
+    again = run(rest, dataclasses.replace(physics, damping_time=0.02, drag=0.0), 100)
+    assert np.abs(again - rest).max() < 5e-6
+
+
 @pytest.mark.parametrize("count", [1, 13])
 def test_too_few_and_too_many_samples_are_refused(swung, count):
     physics, position, frames, shown, _ = swung

@@ -21,15 +21,14 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.stats import norm, t
 
-from cablejax.bounded import Result, solve_arrow
+from cablejax.bounded import Result
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation
-from cablejax.diagnose.refits import independent
 from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.growing import beginning
-from cablejax.spatial.windows import FITTED
+from cablejax.spatial.uncertainty import resolution, sources
 
 # Predictions may be off by what edges and time steps of finite length do; values are not to make up for it. Fits are
 # made in rounds of at most `_STEPS` steps, predictions corrected before each, until no value moves by this share of its
@@ -42,7 +41,6 @@ REPORTED = 0.95
 """Quantile at which reported intervals end."""
 # Windows that are fitted where the material frame is followed.
 _TWISTED_WINDOWS = 24
-_LARGEST_STEP = 1.0
 
 Quantity = Callable[[Float[Array, "P"]], Float[Array, ""]]
 """Something that follows from the values of all effects, differentiably."""
@@ -82,9 +80,14 @@ class Interval:
             self.value + float(np.hypot(self.high - self.value, more)),
         )
 
-    def among(self, count: int) -> Interval:
-        """One of `count` intervals that hold all their true values in nine of ten cases (Bonferroni)."""
-        times = float(norm.ppf(1 - (1 - REPORTED) / count) / norm.ppf(REPORTED))
+    def among(self, count: int, freedom: int) -> Interval:
+        """One of `count` intervals that hold all their true values in nine of ten cases (Bonferroni).
+
+        Args:
+            count: of the intervals.
+            freedom: of Student's distribution, by which this one is as wide as it is.
+        """
+        times = float(t.ppf(1 - (1 - REPORTED) / count, freedom) / t.ppf(REPORTED, freedom))
         low, high = self.value - times * (self.value - self.low), self.value + times * (self.high - self.value)
         return Interval(self.value, low, high)
 
@@ -101,7 +104,7 @@ class Estimate:
     Attributes:
         layout: of the values.
         explanation: that was fitted.
-        moves: what leaving out each recording does to the shared values, see `jackknife`, shape [R, P].
+        moves: what leaving out each recording does to the shared values, see `uncertainty.jackknife`, shape [R, P].
         shifts: what moving each prior by its standard deviation does to them, and last what the error of the corrected
             predictions does, as `resolution` has it, shape [K + 1, P].
         speed: of the keypoints, root mean square [m/s].
@@ -117,6 +120,11 @@ class Estimate:
     settled: bool = True
 
     @property
+    def freedom(self) -> int:
+        """Of the jackknife: one less than there are recordings."""
+        return len(self.moves) - 1
+
+    @property
     def shared(self) -> Float[np.ndarray, "P"]:
         """Values that all recordings share."""
         return self.explanation.vector(self.layout.effects)
@@ -130,7 +138,7 @@ class Estimate:
         with jax.enable_x64(True):
             value, slope = jax.value_and_grad(quantity)(jnp.asarray(self.shared, float))
         value, slope = float(value), np.asarray(slope)
-        left_out = t.ppf(REPORTED, len(self.moves) - 1) * np.linalg.norm(self.moves @ slope)
+        left_out = t.ppf(REPORTED, self.freedom) * np.linalg.norm(self.moves @ slope)
         error = float(np.hypot(left_out, norm.ppf(REPORTED) * np.linalg.norm(self.shifts @ slope)))
         return Interval(value, value - error, value + error)
 
@@ -199,7 +207,7 @@ def estimate(
         rounds += 1
         evidence = cable.corrected(start).evidence()
         (fit,) = improve(evidence, evaluate(evidence, [start]), max_iterations=steps, tolerance=tolerance)
-        error = np.hypot(*(np.linalg.norm(rows, axis=0) for rows in _rows(evidence, fit)))
+        error = np.hypot(*(np.linalg.norm(rows, axis=0) for rows in sources(evidence, fit)))
         moved = float((np.abs(fit.explanation.z - start.z) / error).max(initial=0.0))
         progress(f"corrected for finite edges and time steps: values move by up to {moved:.2f} standard errors")
         # a round of steps that were all too long says nothing, and the next one needs more of them
@@ -239,58 +247,6 @@ def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
     assert isinstance(cable, SpatialCable)
     # of the vector by the coordinates
     slopes = cable.directions(one)[0]
-    moves, shifts = _rows(evidence, fit)
+    moves, shifts = sources(evidence, fit)
     shifts = np.vstack([shifts, resolution(evidence, fit)])
     return Estimate(cable.layout, one, moves @ slopes, shifts @ slopes, cable.windows.speed)
-
-
-def _rows(evidence: Evidence, fit: Fit) -> tuple[Float[np.ndarray, "R K"], Float[np.ndarray, "K K"]]:
-    """What leaving out each recording, and what moving each prior, does to the coordinates.
-
-    With S the curvature of the cost in prior standard deviations, the recordings' own values eliminated, the fit is off
-    the true values by -S^-1 times these, were there no errors in the data: it is drawn towards the prior. On average
-    over the prior the square of that, for anything linear in the values, is the sum of its squares over rows.
-    """
-    return jackknife(evidence, fit), np.linalg.inv(fit.precision(evidence))
-
-
-def resolution(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "K"]:
-    """What the error of the edges in corrected predictions does to the shared coordinates, by one Gauss-Newton step.
-
-    The next order of the extrapolation shows it. If a cable bends over less than an edge, as next to a gripper, an
-    estimate may rest on it.
-
-    Args:
-        evidence: of a `SpatialCable.corrected`.
-        fit: to it.
-    """
-    cable = evidence.simulator
-    assert isinstance(cable, SpatialCable) and cable.correction is not None
-    left = cable.exact(1).left_by_edges(fit.explanation)[:, FITTED]
-    finer = dataclasses.replace(cable, correction=cable.correction + left)
-    (there,) = evaluate(dataclasses.replace(evidence, simulator=finer), [fit.explanation])
-    weight = evidence.weight(fit.sse)
-    here, moved = fit.model(weight, 0.0), there.model(weight, 0.0)
-    found = -solve_arrow(here.curvature, moved.gradient - here.gradient, here.blocks)
-    return _bounded(found)[: len(fit.explanation.z)]
-
-
-def jackknife(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "R K"]:
-    """Change of the shared coordinates when each recording is left out, by one Gauss-Newton step (Miller 1974).
-
-    Scaled so that the standard error of anything linear in them is the root of its sum of squares over rows.
-    """
-    label = independent(np.asarray(evidence.simulator.recording)[evidence.episodes])
-    weight, names = evidence.weight(fit.sse), np.unique(label)
-
-    def step(use):
-        model = fit.model(np.where(use, weight, 0.0), 0.0)
-        return _bounded(-solve_arrow(model.curvature, model.gradient, model.blocks))[: len(fit.explanation.z)]
-
-    full = step(np.ones(len(label), bool))
-    return np.sqrt((len(names) - 1) / len(names)) * np.array([step(label != name) - full for name in names])
-
-
-def _bounded(step: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
-    """A step, or as much of it as the linear picture reaches."""
-    return step * min(1.0, _LARGEST_STEP / max(np.abs(step).max(initial=0.0), 1e-12))

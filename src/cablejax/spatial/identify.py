@@ -158,10 +158,14 @@ def identify(
         f"{1e3 * time_steps.error:.1f} mm"
     )
     cable = dataclasses.replace(cable.finer(time_steps.substeps), shown=2 + math.ceil(_SHOWN / windows.interval))
-    picked = cable.some(_SEARCHED)
-    memory = Memory(state, fingerprint(cable, names), layout)
+    # a recording is in the same half in the search and in the estimates: what has seen it is not scored on it
+    first = halves(windows.group)
+    searched = _searched(windows, first)
+    picked = cable.chosen(searched)
+    memory = Memory(state, fingerprint(cable, names, first), layout)
     steps = search(
         picked,
+        first[searched],
         [name for name in names if name != TWISTED],
         begun=memory.done("search"),
         save=lambda found: memory.keep("search", found),
@@ -171,12 +175,11 @@ def identify(
         found = memory.done("twisted")
         if not found:
             progress("rest curvature, which needs the material frame: slower")
-            found = _twisted(picked, steps, progress)
+            found = _twisted(picked, first[searched], steps, progress)
             memory.keep("twisted", found)
         steps += found
     last = [step for step in steps if step.accepted][-1]
-    cable = cable.trusting(unseen_error(cable, last.halves))
-    first = halves(windows.group)
+    cable = cable.trusting(unseen_error(cable, first, last.halves))
     one, other, everything = _estimates(cable, first, last.halves, names, memory, progress)
     return Identified(
         cable=_for_predictions(dataclasses.replace(cable, shown=2), everything.explanation),
@@ -188,6 +191,12 @@ def identify(
         halves=(one, other),
         first=first,
     )
+
+
+def _searched(windows: Windows, first: Bool[np.ndarray, "W"]) -> Int[np.ndarray, "S"]:
+    """Windows that the search sees, as many of either half where there are as many."""
+    parts = (np.flatnonzero(part) for part in (first, ~first))
+    return np.sort(np.concatenate([part[windows.chosen(part).whole(_SEARCHED // 2)] for part in parts]))
 
 
 def _estimates(cable: SpatialCable, first, begun, tried, memory: Memory, progress) -> list[Estimate]:
@@ -219,13 +228,13 @@ def _for_predictions(cable: SpatialCable, one: Explanation) -> SpatialCable:
     return exact
 
 
-def _twisted(cable: SpatialCable, steps: Sequence[Step], progress) -> list[Step]:
+def _twisted(cable: SpatialCable, first: Bool[np.ndarray, "W"], steps: Sequence[Step], progress) -> list[Step]:
     """Rest curvature on top of what was found, and in place of a stiffness profile, its look-alike."""
     before, effect = [step for step in steps if step.accepted][-1], cable.layout.named(TWISTED)
     trials = []
     for rival in ("", _RIVAL) if _RIVAL in before.halves[0].names else ("",):
         one, other = (base.without(rival).plus((effect, 0, effect.null)) for base in before.halves)
-        trials.append(tried_with(cable, TWISTED, (one, other), before, progress, rival))
+        trials.append(tried_with(cable, first, TWISTED, (one, other), before, progress, rival))
     best = min((t for t in trials if t.accepted), key=lambda t: moderated(t.error).mean(), default=None)
     # the better one of the two stays, and comes last
     return sorted((dataclasses.replace(t, accepted=t is best) for t in trials), key=lambda t: t.accepted)

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool
 
 from cablejax.diagnose.protocol import Explanation, Term
 from cablejax.spatial.cable import SpatialCable
@@ -21,8 +22,8 @@ from cablejax.text_file import read_json
 from cablejax.whole_file import whole_file
 
 
-def fingerprint(cable: SpatialCable, names: Sequence[str]) -> str:
-    """Inputs that a stored state must have been made from."""
+def fingerprint(cable: SpatialCable, names: Sequence[str], first: Bool[np.ndarray, "W"]) -> str:
+    """Inputs that a stored state must have been made from; `first` are the windows of the first half."""
     layout, windows = cable.layout, cable.windows
     simulated = (cable.rod, cable.exact().edges, cable.shown)
     digest = hashlib.sha256(
@@ -30,7 +31,7 @@ def fingerprint(cable: SpatialCable, names: Sequence[str]) -> str:
     )
     # what coordinates and values mean is among the inputs: those of another version may mean something else
     meaning = [np.asarray(part, np.float32) for part in jax.tree.leaves(layout.physics(layout.null + 0.5))]
-    arrays = (windows.keypoints, windows.position, windows.frames, windows.valid, windows.group)
+    arrays = (windows.keypoints, windows.position, windows.frames, windows.valid, windows.group, first)
     for array in (*arrays, np.float64(windows.interval), *meaning):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

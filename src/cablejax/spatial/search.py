@@ -90,6 +90,7 @@ def accepted_effects(steps: Sequence[Step]) -> list[str]:
 
 def search(
     cable: SpatialCable,
+    first: Bool[np.ndarray, "W"],
     candidates: Sequence[str],
     *,
     begun: Sequence[Step] = (),
@@ -100,6 +101,7 @@ def search(
 
     Args:
         cable: in the windows to explain.
+        first: those of the first half of the recordings; some of either are needed.
         candidates: names of the effects to try.
         begun: steps of an earlier call that was interrupted.
         save: called with all steps after each.
@@ -111,7 +113,7 @@ def search(
     steps = list(begun)
     if not steps:
         null = explanation()
-        error = unseen_error(cable, (null, null))
+        error = unseen_error(cable, first, (null, null))
         steps = [Step("", True, (null, null), error, 0.0)]
         progress(f"nominal simulator: {1e3 * moderated(error).mean():.1f} mm from the free markers")
     while True:
@@ -123,9 +125,9 @@ def search(
         if not rest or failures == _FAILURES:
             return steps
         trusted = cable.trusting(steps[last].error)
-        starts = {name: _starts(trusted, steps[last].halves, cable.layout.named(name)) for name in rest}
+        starts = {name: _starts(trusted, first, steps[last].halves, cable.layout.named(name)) for name in rest}
         for name in sorted(rest, key=lambda name: starts[name][1]):
-            steps.append(tried_with(cable, name, starts[name][0], steps[last], progress))
+            steps.append(tried_with(cable, first, name, starts[name][0], steps[last], progress))
             save(steps)
             failures += steps[-1].counts
             if steps[-1].accepted or failures == _FAILURES:
@@ -134,6 +136,7 @@ def search(
 
 def tried_with(
     cable: SpatialCable,
+    first: Bool[np.ndarray, "W"],
     name: str,
     starts: tuple[Explanation, Explanation],
     before: Step,
@@ -144,6 +147,7 @@ def tried_with(
 
     Args:
         cable: in all windows.
+        first: those of the first half of the recordings.
         name: of what is tried.
         starts: for either half.
         before: the step to compare with.
@@ -151,11 +155,11 @@ def tried_with(
         instead_of: the effect that the starts do without, if any.
     """
     fits = []
-    for start, (seen, _, _) in zip(starts, _parts(cable.trusting(before.error)), strict=True):
+    for start, (seen, _, _) in zip(starts, _parts(cable.trusting(before.error), first), strict=True):
         evidence = seen.evidence()
         fits += improve(evidence, evaluate(evidence, [beginning(seen, [start])]), cable.plan.last_steps)
     fitted = fits[0].explanation, fits[1].explanation
-    error = unseen_error(cable, fitted)
+    error = unseen_error(cable, first, fitted)
     better, chance = falls(before.error, error, cable.recording)
     # with the effect at its null value, what the fits gained is due to their further steps
     accepted = better and any(_is_there(cable, name, one) for one in fitted)
@@ -174,25 +178,28 @@ def _is_there(cable: SpatialCable, name: str, one: Explanation) -> bool:
     return bool((one.vector(cable.layout.effects)[slots] != effect.null).any() or (effect.own and one.own.any()))
 
 
-def unseen_error(cable: SpatialCable, halves: tuple[Explanation, Explanation]) -> Float[np.ndarray, "W"]:
-    """Error of every window by the fit of the other half [m]."""
+def unseen_error(
+    cable: SpatialCable, first: Bool[np.ndarray, "W"], halves: tuple[Explanation, Explanation]
+) -> Float[np.ndarray, "W"]:
+    """Error of every window by the fit of the other half [m]; `first` are those of the first half."""
     error = np.zeros(len(cable.windows))
-    for one, (_, other, index) in zip(halves, _parts(cable), strict=True):
+    for one, (_, other, index) in zip(halves, _parts(cable, first), strict=True):
         unseen = other.evidence()
         error[index] = mean_error(unseen.predict([one])[0], unseen.observed)
     return error
 
 
-def _parts(cable: SpatialCable) -> list[tuple[SpatialCable, SpatialCable, Int[np.ndarray, "_"]]]:
+def _parts(
+    cable: SpatialCable, first: Bool[np.ndarray, "W"]
+) -> list[tuple[SpatialCable, SpatialCable, Int[np.ndarray, "_"]]]:
     """The cable in what either half's fit sees, and in what it does not, with its place among the windows."""
-    first = halves(cable.recording)
     index = [np.flatnonzero(half) for half in (first, ~first)]
     one, other = map(cable.chosen, index)
     return [(one, other, index[1]), (other, one, index[0])]
 
 
 def _starts(
-    cable: SpatialCable, before: tuple[Explanation, Explanation], effect: SpatialEffect
+    cable: SpatialCable, first: Bool[np.ndarray, "W"], before: tuple[Explanation, Explanation], effect: SpatialEffect
 ) -> tuple[tuple[Explanation, Explanation], float]:
     """Where fits with one more effect may begin, per half, and the error on what each has not seen.
 
@@ -200,7 +207,7 @@ def _starts(
     cable that swings differ in phase under any parameter, so there what only calms it down would come first.
     """
     found, total = [], 0.0
-    for base, parts in zip(before, _parts(cable), strict=True):
+    for base, parts in zip(before, _parts(cable, first), strict=True):
         seen, other = (early(part.some(_PROMISED)).evidence() for part in parts[:2])
         found.append(_start(seen, base, effect))
         total += typical_error(other, found[-1])

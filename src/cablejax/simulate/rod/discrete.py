@@ -166,7 +166,11 @@ class DiscreteRod:
         return offset[:, :1] * (mark @ a) + offset[:, 1:] * (mark @ b)
 
     def through(
-        self, markers: Float[Array, "N 3"], held: Float[Array, "4 3"], guess: Float[Array, "f 3"]
+        self,
+        markers: Float[Array, "N 3"],
+        held: Float[Array, "4 3"],
+        guess: Float[Array, "f 3"],
+        forces: Float[Array, "f 3"] | float = 0.0,
     ) -> tuple[Float[Array, "n 3"], Bool[Array, ""]]:
         """Nodes of the cable at rest that observed markers pull towards themselves, and whether they were found.
 
@@ -174,11 +178,12 @@ class DiscreteRod:
             markers: where the centreline is to pass [m].
             held: the first two and the last two nodes [m].
             guess: free nodes to start from [m]; no derivative passes through it.
+            forces: of rest curvature and twist, see `forces` [m/s^2].
         """
         n = self.n
         pins, pull = self._pulled(markers, held, jnp.sqrt(_PIN / self.h))
         pinned = ElasticChain(jnp.zeros(n - 4), self.bending, self.h, self.compliance, pins)
-        force = pull + self.physics.gravity
+        force = pull + self.mass * self.physics.gravity + forces
         free, _, error = constrained(True, pinned, force, held, *jax.lax.stop_gradient((guess, jnp.zeros(n - 3))))
         return with_held(free, held), error <= TOLERANCE
 

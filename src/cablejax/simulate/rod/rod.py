@@ -176,15 +176,16 @@ class Rod:
         known = jnp.concatenate([held[0][1:2], seen[0], held[0][2:3]])
         guess = jnp.stack([jnp.interp(nodes_s, known_s, known[:, k]) for k in range(3)], axis=1)[2:-2]
         start, found = discrete.through(seen[0], held[0], guess)
-        offsets = jnp.zeros_like(seen[0])
+        offsets, forces = jnp.zeros_like(seen[0]), 0.0
         if self.twisting:
-            offsets = discrete.marker_offsets(*discrete.first_frames(start, side[0]))
-            start, again = discrete.through(seen[0] - offsets, held[0], start[2:-2])
+            frames = discrete.first_frames(start, side[0])
+            offsets, forces = discrete.marker_offsets(*frames), discrete.forces(start, *frames)
+            start, again = discrete.through(seen[0] - offsets, held[0], start[2:-2], forces)
             found &= again
-        second, also = discrete.through(seen[1] - offsets, held[1], start[2:-2])
+        second, also = discrete.through(seen[1] - offsets, held[1], start[2:-2], forces)
         velocity = (second - start) / interval
         none = jnp.zeros((n - 1, 3))
-        directors, tangents = discrete.first_frames(second, side[0]) if self.twisting else (none, none)
+        directors, tangents = discrete.first_frames(second, side[1]) if self.twisting else (none, none)
         dt, slack = interval / self.substeps, jnp.zeros(n - 3)
         motion = Motion(
             second,
