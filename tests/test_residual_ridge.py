@@ -49,18 +49,6 @@ def test_dual_form_equals_primal_form(bias, n):
         np.testing.assert_allclose(apply(fit(delta, twist, valid, config), query), expected, rtol=1e-9, atol=1e-15)
 
 
-def test_dual_gram_is_never_worse_conditioned_than_the_primal():
-    for seed in range(5):
-        config = RidgeConfig()
-        delta, twist, valid = window(seed)
-        rows = scaled_regressors(twist, config)
-        primal = np.linalg.cond(rows.T @ rows + config.regularisation * np.eye(rows.shape[1]))
-        reported = float(fit(delta, twist, valid, config).condition)
-        dual = np.linalg.cond(rows @ rows.T + config.regularisation * np.eye(W))
-        assert reported == pytest.approx(dual, rel=1e-4)
-        assert reported <= primal * (1 + 1e-4)
-
-
 def test_recovers_an_affine_error():
     config = RidgeConfig(regularisation=1e-4)
     rng = np.random.default_rng(1)
@@ -100,7 +88,6 @@ def test_empty_window_corrects_nothing():
     model = fit(delta * jnp.nan, twist, jnp.zeros(W, bool), RidgeConfig())
     np.testing.assert_array_equal(model.gain, 0.0)
     np.testing.assert_array_equal(model.bias, 0.0)
-    assert float(model.condition) == 1.0
     np.testing.assert_array_equal(apply(zero_residual(N), twist[0]), 0.0)
 
 

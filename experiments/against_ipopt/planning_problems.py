@@ -92,7 +92,7 @@ class ProblemMaker:
     def __call__(self, case: PlanningCase) -> ShapingProblem:
         """The problem."""
         pose = self._cast(case.gripper_pose)
-        residual = ResidualModel(self._cast(case.gain), self._cast(case.bias), jnp.ones((), self.precision))
+        residual = ResidualModel(self._cast(case.gain), self._cast(case.bias))
         limits = CONFIG.min_distance * CONFIG.cable_length, CONFIG.max_distance * CONFIG.cable_length
         return ShapingProblem(
             dynamics=self._dynamics,  # pyright: ignore[reportAttributeAccessIssue]

@@ -141,7 +141,6 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
         result=plan.result,
         action=decision.action,
         residual_share=jnp.nan_to_num(size_online / jnp.maximum(size_offline + size_online, 1e-12)),
-        condition=jnp.ones_like(error) if residual is None else residual.condition,
         unobserved=unobserved,
         weights=_beliefs(config, state),
         belief=None if estimate is None else estimate.belief,

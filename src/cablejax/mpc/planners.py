@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import ClassVar
 
 import optimistix as optx
 
@@ -52,14 +52,16 @@ def bounded_plan(
 
 
 @dataclasses.dataclass(frozen=True)
-class _LeastSquaresPlanner(abc.ABC):
-    """Common settings of these planners.
+class _LeastSquaresPlanner:
+    """Common settings of these planners. None has a secant model: planning uses few steps.
 
     Attributes:
         max_iterations: linearisations at most; one costs as much as about ten rollouts.
         trials_per_linearisation: trial plans after each, a rollout each; the Jacobian follows them by Broyden's update.
         tolerance: stop once a unit projected gradient step moves no coordinate by more than this [m].
     """
+
+    _bounded: ClassVar[type[AbstractBoundedLeastSquares]]
 
     max_iterations: int = 1
     trials_per_linearisation: int = 5
@@ -68,39 +70,30 @@ class _LeastSquaresPlanner(abc.ABC):
     def __post_init__(self):
         check(self, max_iterations="count", trials_per_linearisation="count", tolerance="positive")
 
-    @abc.abstractmethod
-    def bounded(self) -> AbstractBoundedLeastSquares:
-        """The solver that finds the plan."""
-
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         """The plan from a guess; differentiable in the problem where it has converged."""
-        return bounded_plan(problem, guess, self.bounded(), self.max_iterations)
+        solver = self._bounded(
+            atol=self.tolerance, secant=False, trials_per_linearisation=self.trials_per_linearisation
+        )
+        return bounded_plan(problem, guess, solver, self.max_iterations)
 
 
 class LevenbergMarquardt(_LeastSquaresPlanner):
     """Solver: damped Gauss-Newton models of the objective, minimised over the feasible set."""
 
-    def bounded(self) -> AbstractBoundedLeastSquares:
-        """The solver without a secant model: planning uses few steps."""
-        return BoundedLevenbergMarquardt(
-            atol=self.tolerance, secant=False, trials_per_linearisation=self.trials_per_linearisation
-        )
+    _bounded = BoundedLevenbergMarquardt
 
 
 class Dogleg(_LeastSquaresPlanner):
     """Solver: a trust region around Gauss-Newton models, its steps along the dogleg inside the feasible set."""
 
-    def bounded(self) -> AbstractBoundedLeastSquares:
-        """The solver without a secant model: planning uses few steps."""
-        return BoundedDogleg(atol=self.tolerance, secant=False, trials_per_linearisation=self.trials_per_linearisation)
+    _bounded = BoundedDogleg
 
 
 class GaussNewton(_LeastSquaresPlanner):
     """Solver: Gauss-Newton models without damping, minimised over the feasible set, and a line search towards that."""
 
-    def bounded(self) -> AbstractBoundedLeastSquares:
-        """The solver with these settings."""
-        return BoundedGaussNewton(atol=self.tolerance, trials_per_linearisation=self.trials_per_linearisation)
+    _bounded = BoundedGaussNewton
 
 
 @dataclasses.dataclass(frozen=True)

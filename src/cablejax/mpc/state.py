@@ -130,7 +130,6 @@ class MPCInfo:
         result: a `bounded.Result`: how the solve ended; `NONFINITE` also where its plan is not finite.
         action: an `Action`.
         residual_share: |residual's displacement| / (|model's| + |residual's|) of the command, in [0, 1].
-        condition: condition number of the ridge system; 1 where no ridge is fitted.
         unobserved: keypoints not observed now, replaced by their prediction.
         weights: weight of each of the learner's candidates, shape [K]; None without a learner.
         belief: current estimate of the cable; None without adaptation.
@@ -144,7 +143,6 @@ class MPCInfo:
     result: Int[Array, "*batch"]
     action: Int[Array, "*batch"]
     residual_share: Float[Array, "*batch"]
-    condition: Float[Array, "*batch"]
     unobserved: Int[Array, "*batch"]
     weights: Float[Array, "*batch K"] | None
     belief: CableBelief | None

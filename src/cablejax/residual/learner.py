@@ -293,8 +293,7 @@ def _response_share(
 
 
 def _mixed(models: list[ResidualModel], weight: Float[Array, " K"]) -> ResidualModel:
-    """The candidates' weighted mean; its condition number is the worst of theirs."""
+    """The candidates' weighted mean."""
     gain = sum(w * model.gain for w, model in zip(weight, models, strict=True))
     bias = sum(w * model.bias for w, model in zip(weight, models, strict=True))
-    condition = jnp.stack([model.condition for model in models]).max()
-    return ResidualModel(gain, bias, condition)  # pyright: ignore[reportArgumentType]
+    return ResidualModel(gain, bias)  # pyright: ignore[reportArgumentType]

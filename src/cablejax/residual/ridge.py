@@ -77,19 +77,15 @@ class ResidualModel:
     Attributes:
         gain: J, displacement error per unit of twist [m / (m/s)] and [m / (rad/s)], shape [3Q, 2N].
         bias: displacement error at rest [m], shape [2N]; zero if it was not fitted.
-        condition: condition number of the regularised Gram matrix that was solved, shape [].
     """
 
     gain: Float[Array, "*batch R C"]
     bias: Float[Array, "*batch C"]
-    condition: Float[Array, "*batch"]
 
 
 def zero_residual(n_keypoints: int, n_grippers: int = 2) -> ResidualModel:
     """The residual that changes nothing, for N keypoints and Q grippers."""
-    return ResidualModel(
-        gain=jnp.zeros((3 * n_grippers, 2 * n_keypoints)), bias=jnp.zeros(2 * n_keypoints), condition=jnp.ones(())
-    )
+    return ResidualModel(gain=jnp.zeros((3 * n_grippers, 2 * n_keypoints)), bias=jnp.zeros(2 * n_keypoints))
 
 
 def fit(
@@ -107,7 +103,7 @@ def fit(
     smallest eigenvalue, with no more samples than inputs, is never below that of the primal. All columns of one
     keypoint share a system; keypoints have their own because each may have been unobserved at other instants.
 
-    Differentiable in `delta` and `twist` (the reported condition number is not).
+    Differentiable in `delta` and `twist`.
 
     Args:
         delta: error of the model's displacement, `X(t+1) - X(t) - f(X(t), R(t))` [m], shape [W, N, 2], oldest first.
@@ -145,12 +141,7 @@ def fit(
     n_inputs = units.shape[0]
     gain = coefficients[:n_inputs].reshape(n_inputs, -1) / units[:, None]
     bias = coefficients[n_inputs] * BIAS_SCALE if config.bias else jnp.zeros_like(delta[0])
-    seen = root_weight.max(axis=1)
-    return ResidualModel(
-        gain=gain,
-        bias=bias.reshape(-1),
-        condition=_condition(jax.lax.stop_gradient(seen[:, None] * regressors), config.regularisation),
-    )
+    return ResidualModel(gain=gain, bias=bias.reshape(-1))
 
 
 def apply(model: ResidualModel, twist: Float[Array, "Q 3"]) -> Float[Array, "N 2"]:
@@ -175,10 +166,3 @@ def _dual_ridge(
     gram = weighted @ weighted.T + regularisation * jnp.eye(regressors.shape[0], dtype=regressors.dtype)
     factor = jax.scipy.linalg.cho_factor(gram)
     return weighted.T @ jax.scipy.linalg.cho_solve(factor, root_weight[:, None] * target)
-
-
-def _condition(weighted: Float[Array, "W R"], regularisation: float) -> Float[Array, ""]:
-    """Condition number of the regularised dual Gram matrix."""
-    gram = weighted @ weighted.T + regularisation * jnp.eye(weighted.shape[0], dtype=weighted.dtype)
-    eigenvalues = jnp.linalg.eigvalsh(gram)
-    return eigenvalues[-1] / eigenvalues[0]
