@@ -247,13 +247,36 @@ def test_a_model_that_yields_nan_makes_the_grippers_hold_still_and_says_so():
     assert np.linalg.norm(twist) > 0.01 and int(info.result) != Result.NONFINITE
 
 
-def test_where_bounds_contradict_each_other_the_grippers_hold_still():
+HEMMED = dataclasses.replace(WITHOUT, workspace=((-3.0, -1.0), (-1.0, 3.0)), restart_after=1)
+OUTSIDE = {
+    "nowhere": [[-2.0, 0.0, 1.57], [-2.0, 0.9, 1.57]],
+    "too far apart": [[-2.0, 0.0, 1.57], [-2.0, 1.2, 1.57]],
+    "too near": [[-2.0, 0.0, -0.5], [-2.0, 0.05, 3.64]],
+    "outside the workspace": [[-0.9, 0.0, 1.57], [-0.8, 0.9, 1.57]],
+    "outside two bounds that contradict each other": [[-0.8, 0.0, 1.57], [-0.8, 1.3, 1.57]],
+}
+
+
+@pytest.mark.parametrize("where", OUTSIDE)
+def test_grippers_that_hold_come_back_from_outside_of_their_bounds_and_then_rest(where):
+    """Of a model that gives NaN no plan is followed, so every command is that of holding still."""
+    cable = Cable(pose=OUTSIDE[where])
+    _, twists, info = run(controller(config=HEMMED, rate=float("nan")), cable, 40)
+    assert (info.action == Action.HOLD).all()
+    size = np.linalg.norm(twists * [1, 1, 0.15], axis=-1)
+    assert (size <= 0.05).all()
+    assert (twists[0 if where == "nowhere" else 38 :] == 0).all()
+    (low, high), place = np.array(HEMMED.workspace), cable.pose[:, :2]
+    assert (place >= low - 1e-6).all() and (place <= high + 1e-6).all()
+    assert 0.15 - 1e-6 <= np.hypot(*(place[1] - place[0])) <= 0.99 + 1e-6
+
+
+def test_where_bounds_contradict_each_other_no_plan_is_followed_until_they_agree():
     """Too far apart and outside the workspace, which cannot both be mended as fast as is asked: no straightening."""
-    config = dataclasses.replace(WITHOUT, workspace=((-3.0, -1.0), (-1.0, 3.0)), restart_after=1)
-    cable = Cable(pose=[[0.0, 0.0, 1.57], [0.0, 1.5, 1.57]])
-    state, twists, info = run(controller(config=config), cable, 3)
-    assert (info.result == Result.EMPTY_SET).all()
-    assert (twists == 0).all() and int(state.progress.restarts) == 0
+    cable = Cable(pose=OUTSIDE["outside two bounds that contradict each other"])
+    state, _, info = run(controller(config=HEMMED), cable, 3)
+    assert (info.result == Result.EMPTY_SET).all() and (info.action == Action.HOLD).all()
+    assert int(state.progress.restarts) == 0
 
 
 @pytest.mark.slow

@@ -36,7 +36,8 @@ class Starts(NamedTuple):
 
     Attributes:
         guess: the better of two starts: the last plan, shifted by the command that was executed, and the straight way.
-        still: holding, or where motions may not change at once, braking [m], shape [T, Q, 3].
+        still: holding still as nearly as the bounds allow: grippers outside of them come back, and where motions may
+            not change at once, they brake [m], shape [T, Q, 3].
         value_still: its objective [m^2], shape [].
         straightening: the way to where the cable is straight, feasible.
         back: the way to where the shape error was lowest, feasible.
@@ -69,18 +70,15 @@ def find_starts(
     # what leads away from here does not rest on the model
     to_straight = _straight_way(config, problem, apart, radius_max)
     to_best = _straight_way(config, problem, best_pose, radius_max)
-    still = jnp.zeros_like(last)
     shifted = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
-    wanted = jnp.stack([shifted, to_target.motion, to_straight.motion, to_best.motion, still])
+    wanted = jnp.stack([shifted, to_target.motion, to_straight.motion, to_best.motion, jnp.zeros_like(last)])
     # one after the other: vmap would run the interior-point method for all, and several calls would compile it for each
     bounds = jnp.stack([radius, radius, radius_max, radius_max, radius])
-    n = 5 if config.max_change is not None else 4
     allowed = jax.lax.map(
-        lambda pair: dataclasses.replace(problem.feasible, radius=pair[1]).project(pair[0]), (wanted[:n], bounds[:n])
+        lambda pair: dataclasses.replace(problem.feasible, radius=pair[1]).project(pair[0]), (wanted, bounds)
     )
-    if config.max_change is not None:
-        # grippers that move brake first, as fast as they may
-        still = allowed[4]
+    # rest, where it is allowed: not for grippers that are outside their bounds, nor for those that have to brake first
+    still = allowed[4]
     rollouts = jax.vmap(problem.rollout)(jnp.stack([allowed[0], allowed[1], still]))
     values = jax.vmap(problem.value_of)(rollouts)
     best = jnp.argmin(jnp.where(jnp.isfinite(values[:2]), values[:2], jnp.inf))
