@@ -48,16 +48,18 @@ _FAST_TURN = 0.2
 
 
 class Load(NamedTuple):
-    """Forces on the nodes.
+    """Forces on the nodes, and what resists them.
 
     Attributes:
         mass: [kg], shape [n].
+        inertia: of each link about its middle [kg m^2], shape [n].
         drag: force over velocity [N s/m], shape [n]; zero at the two held nodes.
         force: [N], shape [n, 2].
         contact: stiffness of contacts (xx, xy, yy) [N/m], shape [n, 3].
     """
 
     mass: Array
+    inertia: Array
     drag: Array
     force: Array
     contact: Array
@@ -111,7 +113,10 @@ def _load(
     """The two held nodes carry mass only. Gripper 0 is at `root` as the step starts, and has `moved` by its middle."""
     h, n, dtype = config.link_length, config.n_links, start.theta.dtype
     free = jnp.ones(n, dtype).at[jnp.array([0, -1])].set(0.0)
-    mass = physics.density * jnp.asarray(link_lengths(config), dtype) + physics.extra_mass
+    lengths = jnp.asarray(link_lengths(config), dtype)
+    own = physics.density * lengths
+    # what is added is a point on its node, which a turn of the link does not move
+    mass, inertia = own + physics.extra_mass, own * lengths**2 / 12
     rubbed = root + moved + halfway.nodes
     drag = free * drag_coefficient(
         physics, rubbed, halfway.velocity, on_table(physics, mass, h), h, config.friction_speed
@@ -119,7 +124,7 @@ def _load(
     force, contact = jnp.zeros_like(rubbed), jnp.zeros((n, 3), dtype)
     if with_contact:
         force, contact = obstacle_contact(physics, root + start.nodes, h * start.along)
-    return Load(mass, drag, mass[:, None] * physics.tilt + force, contact)
+    return Load(mass, inertia, drag, mass[:, None] * physics.tilt + force, contact)
 
 
 def _joints(config: Discretisation, physics: Physics, state: ChainState, dt) -> tuple[Array, Array]:
@@ -157,7 +162,7 @@ def _matrix(frame: Frame, load: Load, config: Discretisation, joint_implicit, dt
     corner = jnp.sum(weight[:, None] * frame.nodes**2) / frame.scale**2 + 1e-9
     # a joint resists the difference of two links' angles
     between = jnp.pad(joint_implicit, 1)
-    diagonal = jnp.append(own + _inertia(config, load.mass) + between[1:] + between[:-1], corner)
+    diagonal = jnp.append(own + load.inertia + between[1:] + between[:-1], corner)
     neighbours = jnp.append(-joint_implicit, jnp.zeros(2, weight.dtype))
     # entry by entry, in one loop
     later_x, later_y, earlier_x, earlier_y = jnp.pad(jnp.concatenate([later, earlier], axis=1).T, [(0, 0), (0, 1)])
@@ -188,7 +193,7 @@ def _impulses(
         axis=1,
     )
     impulse = impulse - dt**2 * contact_drag
-    spin = _inertia(config, load.mass) * start.rate
+    spin = load.inertia * start.rate
     rhs = _turned(config, halfway, impulse) + spin + dt * jnp.diff(jnp.pad(moment, 1))
     return jnp.append(rhs, jnp.sum(halfway.nodes * impulse) / halfway.scale)
 
@@ -196,11 +201,6 @@ def _impulses(
 def _turned(config: Discretisation, frame: Frame, along: Float[Array, "n 2"]) -> Float[Array, "n"]:
     """Of vectors at the nodes: their components in what each link's angle moves, weighted with its lever."""
     return jnp.sum(frame.turning * (jnp.asarray(levers(config).T, along.dtype) @ along), axis=1)
-
-
-def _inertia(config: Discretisation, mass: Float[Array, "n"]) -> Float[Array, "n"]:
-    """Of each link about its middle [kg m^2]."""
-    return mass * jnp.asarray(link_lengths(config), mass.dtype) ** 2 / 12
 
 
 def _grasps(config: Discretisation, physics: Physics, frame: Frame) -> tuple[Float[Array, "5 n1"], Float[Array, "5"]]:
