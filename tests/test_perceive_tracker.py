@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable
 from cablejax.perceive import Status, Tracker, TrackerConfig, track
 from cablejax.perceive.initial import cloud_path, padded, path_length
+from cablejax.perceive.plant import tracker_for
 from perceive_cases import ARCH, CAPACITY, S_SHAPE, TRACKER, cloud, mean_error, moved, shape
 
 FRAMES = 12
@@ -75,6 +77,33 @@ def test_a_second_without_a_cable_is_held_reported_and_recovered_from(tracker, m
     state, seen = tracker.step(state, cloud(motion[11], 3), motion[11].pose)
     assert seen.status == Status.TRACKED and seen.lost == 0
     assert mean_error(seen.keypoints, motion[11]) < 1e-3
+
+
+def seen_at(length, motion):
+    """Two frames of a cable of this length, by a camera whose noise is as large beside it; lengths in its length."""
+    config = tracker_for(Cable(length=length))
+    by_camera = ("min_sigma", "settled_sigma")
+    registration = dataclasses.replace(
+        config.registration, **{name: length * getattr(config.registration, name) for name in by_camera}
+    )
+    size = {"reach": length * config.reach, "max_sigma": length * config.max_sigma, "capacity": CAPACITY}
+    tracker, state = Tracker(dataclasses.replace(config, registration=registration, **size)), None
+    for frame, cable in enumerate(motion[:2]):
+        points = length * cloud(cable, frame, hidden=(0.3, 0.6), outliers=0.1)
+        pose = cable.pose * [length, length, 1.0]
+        state, seen = tracker.init(points, pose) if state is None else tracker.step(state, points, pose)
+        yield int(seen.status), np.asarray(seen.keypoints) / length, float(seen.sigma) / length
+
+
+@pytest.mark.parametrize("length", [0.3, pytest.param(3.0, marks=pytest.mark.slow)])
+def test_a_cable_of_any_length_is_followed_as_one_of_a_metre_is(motion, length):
+    """The same shapes and random numbers, scaled: every penalty has the dimension that its definition says."""
+    for (status, keypoints, sigma), (_, expected, expected_sigma) in zip(
+        seen_at(length, motion), seen_at(1.0, motion), strict=True
+    ):
+        assert status == Status.TRACKED
+        np.testing.assert_allclose(keypoints, expected, atol=2e-6)
+        assert sigma == pytest.approx(expected_sigma, rel=1e-4)
 
 
 @pytest.mark.slow

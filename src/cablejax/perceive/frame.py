@@ -149,9 +149,8 @@ def track(
     step = gripper_pose - state.gripper_pose
     step = step.at[:, 2].set(wrapped(step[:, 2]))
     pose = state.gripper_pose + step
-    travel = state.travel + jnp.max(
-        jnp.sqrt(jnp.sum(step[:, :2] ** 2, axis=-1) + (ROTATION_WEIGHT * step[:, 2]) ** 2 + 1e-16)
-    )
+    turned = ROTATION_WEIGHT * settings.length * step[:, 2]
+    travel = state.travel + jnp.max(jnp.sqrt(jnp.sum(step[:, :2] ** 2, axis=-1) + turned**2 + 1e-16))
     search = jnp.minimum(jnp.sqrt((WIDENING * state.sigma) ** 2 + travel**2), config.max_search)
 
     def fit(mask) -> CurveFit:

@@ -85,7 +85,11 @@ class CloudPlant(Plant):
 
 
 def tracker_for(cable: Cable) -> TrackerConfig:
-    """A tracker's settings for a cable: the defaults, with lengths that depend on the cable's in proportion to it.
+    """A tracker's settings for a cable: the defaults, so that cables of one shape and any length are found alike.
+
+    What depends on the cable's length L is in proportion to a power of it: the search, the bending weight and the area
+    of outliers as L, L and L^2, the curvature as 1 / L, the weights of motion and structure as 1 / L^2. The scatter of
+    the points and the distance at which one supports the fit are the camera's, and stay as they are.
 
     Raises:
         ValueError: the cable's keypoints are not evenly spaced.
@@ -95,9 +99,16 @@ def tracker_for(cable: Cable) -> TrackerConfig:
             "The cable has keypoints at given arc lengths (marks), and a tracker finds evenly spaced ones. Give it a "
             "cable with marks=None and interpolate between them."
         )
-    ratio = cable.length / Cable.length
+    ratio = cable.length / RegistrationConfig.length
     return TrackerConfig(
-        registration=RegistrationConfig(length=cable.length, n_keypoints=cable.n_keypoints),
+        registration=RegistrationConfig(
+            length=cable.length,
+            n_keypoints=cable.n_keypoints,
+            area=ratio**2 * RegistrationConfig.area,
+            coherence=RegistrationConfig.coherence / ratio**2,
+            structure=RegistrationConfig.structure / ratio**2,
+            bending=ratio * RegistrationConfig.bending,
+        ),
         max_curvature=TrackerConfig.max_curvature / ratio,
         max_search=ratio * TrackerConfig.max_search,
     )
