@@ -215,6 +215,17 @@ def test_an_empty_set_is_distinguished_from_a_point_set():
         assert Result(int(out.result)) is Result.EMPTY_SET
 
 
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_what_counts_as_empty_is_relative_to_the_bounds(size):
+    """A box up to `size` and a plane beyond it or through it, in float32; a third coordinate may go far."""
+    box = Box(jnp.zeros(3), size * jnp.asarray([1.0, 1.0, 100.0]))
+    for room, empty in ((-1e-2, True), (0.0, False), (1e-2, False)):
+        beyond = Halfspaces(jnp.asarray([[-1.0, 0.0, 0.0]]), -size * jnp.asarray([1.0 - room]))
+        both, start = Intersection((box, beyond)), size * jnp.asarray([0.0, 0.0, 0.5])
+        found = least_squares(itself, BoundedLevenbergMarquardt(), start, both, max_steps=20, throw=False)
+        assert (Result(int(found.result)) is Result.EMPTY_SET) == empty
+
+
 def test_a_zero_radius_holds_the_point():
     with jax.enable_x64(True):
         solver, zero = SOLVERS["Levenberg-Marquardt"], Balls(jnp.asarray(0.0))

@@ -19,6 +19,7 @@ from cablejax.mpc import (
     differentiable_plan,
     feasible_from,
 )
+from cablejax.mpc.sampling import Valued, sampled_plan
 from mpc_cases import START, poses, problem
 
 STEPS = 3
@@ -161,3 +162,11 @@ def test_sampling_knows_the_way_back_from_outside(solver):
     assert float(value) <= float(value_at(case, case.start(jnp.asarray(STILL)).motion))
     plan, _, _ = solved(solver, with_bounds(min_distance=1.2))
     assert Result(int(plan.result)) is Result.EMPTY_SET
+
+
+@pytest.mark.parametrize(("size", "expected"), [(1.5, Result.EMPTY_SET), (1.0, Result.STEP_LIMIT)])
+def test_what_sampling_counts_as_broken_is_relative_to_the_bound(size, expected):
+    """A plan a tenth of a millimetre beyond a bound of two tenths, and one on it."""
+    case, motion = with_bounds(radius=2e-4), jnp.zeros_like(STILL, jnp.float32).at[0, 0, 0].set(2e-4 * size)
+    plan = sampled_plan(case, Valued(motion, jnp.asarray(1.0)), 1)
+    assert Result(int(plan.result)) is expected

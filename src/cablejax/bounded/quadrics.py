@@ -10,6 +10,9 @@ import jax.scipy.linalg
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+# Of the size of the largest bound, in units of rounding: what the nearest point may break a small one by.
+_SUMS = 16
+
 
 class Quadrics(eqx.Module):
     """Functions of a point x, `c(x) = G (q z^2 / 2 + p z) + e` with `z = L x + l`, products of vectors by element.
@@ -62,6 +65,14 @@ class Quadrics(eqx.Module):
         whole = jnp.where(jnp.isfinite(self.level), sizes, 0.0).max(initial=0.0)
         whole = jnp.where(self.has_size, whole, jnp.maximum(whole, jnp.linalg.norm(linear)))
         return sizes + jnp.finfo(x.dtype).eps ** 0.4 * whole + jnp.finfo(x.dtype).tiny
+
+    def rounding(self, x: Float[Array, " P"], way: Float[Array, " P"]) -> Float[Array, ""]:
+        """By how much rounding may break the worst bound at x, the nearest point to `x + way`."""
+        eps, bound = jnp.finfo(x.dtype).eps, jnp.argmax(self.values(x))
+        # a large bound that is kept says nothing about a small one that is broken, but for the rounding of the sums
+        whole = (jnp.abs(self.matrix) @ jnp.abs(x) + jnp.abs(self.offset)).max() + jnp.abs(self._levels).max()
+        whole = jnp.where(self.has_size, whole, jnp.maximum(whole, jnp.linalg.norm(way)))
+        return eps**0.5 * (self.sizes(self.lift(x))[bound] + jnp.abs(x).max()) + _SUMS * eps * whole
 
     def values(self, x: Float[Array, " P"]) -> Float[Array, " K"]:
         """C at a point."""

@@ -39,12 +39,20 @@ class AbstractSet(eqx.Module):
     def empty(self) -> Bool[Array, ""]:
         """Whether a bound contradicts itself or another bound of its kind, or is NaN.
 
-        Bounds of several kinds that contradict each other show as `violation(project(y)) > 0`.
+        Bounds of several kinds that contradict each other show as `outside(project(y), y)`.
         """
 
     def violation(self, y: Float[Array, "..."]) -> Float[Array, ""]:
         """By how much the worst bound is broken; 0 inside."""
         return jnp.maximum(self.constraints(y).max(), 0.0)
+
+    def outside(self, y: Float[Array, "*shape"], start: Float[Array, "*shape"]) -> Bool[Array, ""]:
+        """Whether `y`, the projection of `start`, breaks a bound by more than rounding of the bound's own size.
+
+        It does where bounds of several kinds contradict each other: the set is empty.
+        """
+        quadrics = self.at(y).quadrics(y)
+        return ~(self.violation(y) <= quadrics.rounding(y.ravel(), (start - y).ravel()))
 
 
 class ConvexSet(AbstractSet):

@@ -110,7 +110,8 @@ def _solve(entry, fn, solver, y0, feasible: AbstractSet, args, option: str, give
             "solvers keep to no feasible set."
         )
     unknown = jnp.isnan(y0).any() | ~jnp.isfinite(start).all()
-    return _finish(out, fn, args, feasible, start, unknown, throw)
+    apart = ~unknown & feasible.outside(start, y0)
+    return _finish(out, fn, args, feasible.empty() | apart, unknown, throw)
 
 
 def _checked(solver, y0, feasible, max_steps: int) -> tuple[Array, Array]:
@@ -149,14 +150,10 @@ def _value_at_jvp(primals, tangents):
     return known, derivative_along(lambda fn, y, args: value_of(fn(y, args)), tuple(inputs), tuple(tangents[:-1]))
 
 
-def _finish(
-    out: optx.Solution, fn, args, feasible: AbstractSet, start: Array, unknown: Bool[Array, ""], throw: bool
-) -> Solution:
-    """The solution as ours; `unknown` = the start was not finite."""
-    rounding = jnp.finfo(start.dtype).eps ** 0.5 * (1.0 + jnp.abs(start).max())
-    apart = ~unknown & ~(feasible.violation(start) <= rounding)
+def _finish(out: optx.Solution, fn, args, empty: Bool[Array, ""], unknown: Bool[Array, ""], throw: bool) -> Solution:
+    """The solution as ours; `empty` = no point is feasible, `unknown` = the start was not finite."""
     code = jnp.where(unknown, Result.NONFINITE, result_of(out.result))
-    code = jnp.where(feasible.empty() | apart, Result.EMPTY_SET, code).astype(jnp.int32)
+    code = jnp.where(empty, Result.EMPTY_SET, code).astype(jnp.int32)
     solution = Solution(
         value=out.value,
         objective=_value_at(fn, out.value, args, out.stats["objective"]),

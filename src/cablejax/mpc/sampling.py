@@ -138,7 +138,6 @@ def better_plan(best: Valued, drawn: Valued, index: Array) -> Valued:
 def sampled_plan(problem: ShapingProblem, best: Valued, evaluations: int) -> Plan:
     """The best plan as a solver returns it."""
     result = jnp.where(jnp.isfinite(best.value), Result.STEP_LIMIT, Result.NONFINITE)
-    rounding = jnp.finfo(best.motion.dtype).eps ** 0.5
-    broken = problem.feasible.empty() | ~(problem.feasible.violation(best.motion) <= rounding)
-    result = jnp.where(broken, Result.EMPTY_SET, result)
+    empty = problem.feasible.empty() | problem.feasible.outside(best.motion, best.motion)
+    result = jnp.where(empty, Result.EMPTY_SET, result)
     return Plan(best.motion, best.value, jnp.asarray(evaluations, jnp.int32), result.astype(jnp.int32))
