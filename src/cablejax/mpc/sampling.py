@@ -25,10 +25,8 @@ _TEMPERATURE = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
-class CrossEntropy:
-    """Solver: the cross-entropy method (de Boer et al., Ann. Oper. Res. 134, 2005).
-
-    Plans are drawn from a normal distribution and projected; the best of them say the next mean and spread.
+class _Sampling:
+    """Common settings of these planners.
 
     Attributes:
         samples: plans per iteration.
@@ -40,6 +38,13 @@ class CrossEntropy:
 
     def __post_init__(self):
         check(self, samples="count", iterations="count")
+
+
+class CrossEntropy(_Sampling):
+    """Solver: the cross-entropy method (de Boer et al., Ann. Oper. Res. 134, 2005).
+
+    Plans are drawn from a normal distribution and projected; the best of them say the next mean and spread.
+    """
 
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         """Draws plans around a mean, moves the mean to the best of them, and returns the best plan drawn."""
@@ -60,22 +65,11 @@ class CrossEntropy:
         return sampled_plan(problem, best, 1 + self.samples * self.iterations)
 
 
-@dataclasses.dataclass(frozen=True)
-class PathIntegral:
+class PathIntegral(_Sampling):
     """Solver: model predictive path integral control (Williams et al., ICRA 2017).
 
     Plans around the mean are weighted by `exp(-value / temperature)`; their weighted mean is the next one.
-
-    Attributes:
-        samples: plans per iteration.
-        iterations: how often.
     """
-
-    samples: int = 64
-    iterations: int = 5
-
-    def __post_init__(self):
-        check(self, samples="count", iterations="count")
 
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         """Draws plans around a mean, moves the mean to their weighted average, and returns the best plan."""
