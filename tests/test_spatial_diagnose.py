@@ -149,7 +149,7 @@ def test_rest_curvature_is_tried_in_place_of_its_look_alike_too(monkeypatch, bet
     one, error = explanation((profile, 0, profile.null)), np.full(len(windows), 0.01)
     steps = [Step("", True, (explanation(),) * 2, 2 * error, 0.0), Step(profile.name, True, (one, one), error, 0.9)]
 
-    def tried(cable, name, starts, before, progress, instead_of=""):
+    def tried(cable, first, name, starts, before, progress, instead_of=""):
         share = 0.5 if instead_of == better else 0.6
         return Step(name, True, starts, share * before.error, 0.9, instead_of=instead_of)
 
