@@ -449,6 +449,11 @@ def test_the_search_sees_windows_of_both_halves():
     first = halves(many.group)
     seen = _searched(many, first)
     assert len(seen) == len(set(seen)) == 24 and (np.diff(seen) > 0).all() and first[seen].sum() == 12
+    # of a half with one whole window, that one alone
+    valid = many.valid & (
+        (np.arange(many.valid.shape[1]) < 20) | ~first[:, None] | (np.arange(len(many)) == 0)[:, None]
+    )
+    assert first[0] and first[_searched(dataclasses.replace(many, valid=valid), first)].sum() == 1
 
 
 def test_a_recording_at_another_rate_is_sampled_again():

@@ -194,9 +194,9 @@ def identify(
 
 
 def _searched(windows: Windows, first: Bool[np.ndarray, "W"]) -> Int[np.ndarray, "S"]:
-    """Windows that the search sees, as many of either half where there are as many."""
+    """Windows that the search sees, as many of either half where there are as many, at least one."""
     parts = (np.flatnonzero(part) for part in (first, ~first))
-    return np.sort(np.concatenate([part[windows.chosen(part).whole(_SEARCHED // 2)] for part in parts]))
+    return np.sort(np.concatenate([part[windows.chosen(part).whole(_SEARCHED // 2, 1)] for part in parts]))
 
 
 def _estimates(cable: SpatialCable, first, begun, tried, memory: Memory, progress) -> list[Estimate]:

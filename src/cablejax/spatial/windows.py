@@ -86,14 +86,14 @@ class Windows:
     def __len__(self) -> int:
         return len(self.keypoints)
 
-    def whole(self, count: int) -> Int[np.ndarray, "S"]:
+    def whole(self, count: int, least: int = 2) -> Int[np.ndarray, "S"]:
         """Indices of at most `count` windows that are recorded in full and not torn, spread evenly.
 
-        Where fewer than two are, of all that are not torn, else of any: of one window nothing can be held out.
+        Where fewer than `least` are, of all that are not torn, else of any: of one window nothing can be held out.
         """
         intact = ~self.torn
         wanted = (self.valid.mean(axis=1) >= _WHOLE) & intact, intact
-        whole = np.flatnonzero(next((each for each in wanted if each.sum() > 1), np.ones(len(self), bool)))
+        whole = np.flatnonzero(next((each for each in wanted if each.sum() >= least), np.ones(len(self), bool)))
         return whole[np.unique(np.linspace(0, len(whole) - 1, count).astype(int))]
 
     @property
