@@ -297,9 +297,7 @@ def paired_row(
     trials: Sequence[Trial], text: str, measure: Callable[[Trial], float], out: pathlib.Path
 ) -> tuple[str, ...] | None:
     """One effect's row of paired differences; None before its arms have run."""
-    plain, diagnosed, oracle, recorded = (
-        measured(trials, text, f"{kind}{ONLINE}", measure) for kind in ("plain", "diagnosed", "oracle", "recorded")
-    )
+    plain, diagnosed, oracle, recorded = (measured(trials, text, spec.name, measure) for spec in ARMS)
     if not (plain and diagnosed and oracle):
         return None
     ours, best = paired(diagnosed, plain), paired(oracle, plain)

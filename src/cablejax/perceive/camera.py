@@ -117,10 +117,9 @@ class DepthCamera:
         """The cloud of all points classified as cable, shifted to the cable's axis [m], shape [S, 3]; S varies.
 
         Each point is moved on along its ray by the mean depth of a cylinder's axis behind its visible side, seen at a
-        right angle. Across a cable of 10 mm the mean error is then up to about 0.1 mm at the default tilt, 0.5 mm at
-        0.8 rad and 0.7 mm at 1.1 rad, over five directions of the cable: a ray that is oblique to the cable meets the
-        axis deeper, and the part of the visible side that is near the table has no points. A shift along the cable is
-        one that no registration can see.
+        right angle. At other angles a mean error across the cable remains, a part of its radius: a ray that is oblique
+        to the cable meets the axis deeper, and the part of the visible side that is near the table has no points. A
+        shift along the cable is one that no registration can see.
 
         Args:
             nodes: middle of every link, for the two held ones the grasped end [m], as `Plant.nodes` gives them.

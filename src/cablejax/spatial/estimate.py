@@ -106,7 +106,7 @@ class Estimate:
         explanation: that was fitted.
         moves: what leaving out each recording does to the shared values, see `uncertainty.jackknife`, shape [R, P].
         shifts: what moving each prior by its standard deviation does to them, and last what the error of the corrected
-            predictions does, as `resolution` has it, shape [K + 1, P].
+            predictions does, see `uncertainty.resolution`, shape [K + 1, P].
         speed: of the keypoints, root mean square [m/s].
         settled: whether no value moved by more than a small part of its standard error when predictions were last
             corrected for finite edges and time steps.

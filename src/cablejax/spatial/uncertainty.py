@@ -58,15 +58,12 @@ def jackknife(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "R K"]:
     """
     label = independent(np.asarray(evidence.simulator.recording)[evidence.episodes])
     weight, names = evidence.weight(fit.sse), np.unique(label)
-    free = fit.model(weight, 0.0).free
+    models = [fit.model(weight, 0.0), *(fit.model(np.where(label != name, weight, 0.0), 0.0) for name in names)]
+    free = models[0].free
 
     def moves(free):
-        def step(use):
-            model = fit.model(np.where(use, weight, 0.0), 0.0)
-            return _step(model.curvature, model.gradient, model.blocks, free)
-
-        full = step(np.ones(len(label), bool))
-        return np.array([step(label != name) - full for name in names])
+        full, *others = (_step(model.curvature, model.gradient, model.blocks, free) for model in models)
+        return np.array(others) - full
 
     both = np.where(free, moves(free), moves(np.ones_like(free)))[:, : len(fit.explanation.z)]
     return np.sqrt((len(names) - 1) / len(names)) * _reached(both)
