@@ -23,7 +23,7 @@ from cablejax.gaplog import (
     write_gap_log,
 )
 from cablejax.gaplog_join import chosen, commands_derived, joined, recordings
-from cablejax.log_geometry import setup_fault
+from cablejax.log_setup import setup_fault
 from cablejax.text_file import parse_json
 from cablejax.types import GapLog
 from file_cases import with_other_bytes

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable
+from cablejax.diagnose.recording import DiagnosisError
+from cablejax.diagnose.recording import prepare as prepare_log
 from cablejax.gaplog import Episode, GapLogError, gap_log_from_episodes, validate
-from cablejax.log_geometry import cable_fault, setup_fault
+from cablejax.log_setup import cable_fault, setup_fault
 from cablejax.recordings.prepare import Setup, prepare
 from cablejax.recordings.take import Take
 from cablejax.simulate.elastica import elastica
 from cablejax.types import GapLog
 
 CABLE = Cable()
+ARRAYS = ("keypoints", "gripper_pose", "gripper_command", "hold")
 
 
 @functools.cache
@@ -107,6 +110,47 @@ def test_angles_that_were_converted_from_degrees_and_were_none_are_told():
     steady = pose.copy()
     steady[..., 2] = 0.3 + 0.01 * np.random.default_rng(0).standard_normal(pose.shape[:2])
     assert "times as far" not in str(setup_fault(log_of(points, steady)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda angle: -angle, "with the other sign"),
+        (lambda angle: angle + np.pi / 2, "a quarter turn back"),
+        (lambda angle: angle - np.pi / 2, "a quarter turn further"),
+        (lambda angle: np.radians(angle), "turns 5. times as far"),
+        (lambda angle: 0 * angle, "is 0 rad in all samples, but the cable at it turns by"),
+    ],
+    ids=["negated", "quarter turn", "quarter turn back", "converted twice", "dead"],
+)
+def test_angles_that_another_reading_explains_are_not_diagnosed(change, words):
+    points, pose = (whole[:12] for whole in motion(samples=20))
+    log = log_of(points, np.concatenate([pose[..., :2], change(pose[..., 2:])], axis=-1))
+    with pytest.raises(DiagnosisError, match=words):
+        prepare_log(longer(log))
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.5, 1.5])
+@pytest.mark.parametrize("offset", [-1.0, -0.6, 0.6, 1.0])
+def test_a_clamp_as_askew_as_its_effect_may_be_is_diagnosed(heading, offset):
+    points, pose = motion(heading)
+    prepare_log(longer(log_of(points, pose + np.array([0.0, 0.0, offset]))))
+
+
+def test_a_gripper_that_does_not_turn_holds_the_end_of_a_cable_that_bends():
+    """Its angle is the same in all samples, as the cable's at the clamp is."""
+    pose = np.zeros((30, 2, 3))
+    pose[:, 1, 0] = np.linspace(0.9, 0.6, 30)
+    points = np.stack([elastica(one, CABLE.length, CABLE.keypoint_arclength) for one in pose])
+    prepare_log(longer(log_of(points, pose)))
+
+
+def longer(log: GapLog) -> GapLog:
+    """The same motion there and back, until it may be diagnosed."""
+    back = {name: np.concatenate([getattr(log, name), getattr(log, name)[:, ::-1]], axis=1) for name in ARRAYS}
+    time = np.tile(0.1 * np.arange(back["keypoints"].shape[1]), (len(log.time), 1))
+    count = np.full(len(log.time), time.shape[1], np.int32)
+    return dataclasses.replace(log, **back, time=time, episode_length=count)
 
 
 def test_the_end_of_a_short_cable_is_nearer_to_its_gripper():

@@ -15,7 +15,7 @@ from cablejax.diagnose import explanation, verdict_json
 from cablejax.diagnose.diagnosis import ParameterEstimate
 from cablejax.diagnose.fit import evaluate, improve
 from cablejax.gaplog import episodes_of, stack_episodes
-from cablejax.log_geometry import setup_fault
+from cablejax.log_setup import setup_fault
 from cablejax.poses import poses_at
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
@@ -91,14 +91,32 @@ def test_an_axis_that_points_away_from_the_cable_or_passes_it_is_a_fault():
     log = cases.recording()
     assert setup_fault(log) is None
     turned = copy.deepcopy(log)
-    # half a turn about the gripper's own z axis
+    # half a turn about the gripper's own y axis
     w, x, y, z = np.moveaxis(log.gripper_pose[..., 3:], -1, 0)
-    turned.gripper_pose[..., 3:] = np.stack([-z, y, -x, w], axis=-1)
+    turned.gripper_pose[..., 3:] = np.stack([-y, -z, w, x], axis=-1)
     assert "The x axis of gripper 0 is 1" in (setup_fault(turned) or "")
     beside = copy.deepcopy(log)
     beside.gripper_pose[..., 0] += 0.03
     beside.gripper_pose[..., 2] += 0.04
     assert "beside the x axis of gripper" in (setup_fault(beside) or "")
+
+
+def test_gravity_that_points_away_from_where_the_cable_hangs_is_a_fault():
+    log = copy.deepcopy(cases.recording())
+    for gravity in ([0.0, 0.0, 9.81], [0.0, -9.81, 0.0]):
+        log.meta["gravity_m_per_s2"] = gravity
+        with pytest.raises(ValueError, match=r"gravity_m_per_s2.*but the cable sags along \(.*correct gravity's sign"):
+            windows_of(log)
+    # in a stiff cable an arch may stand up
+    log.meta["cable"]["bending_stiffness_n_m2"] = 1e3 * log.meta["cable"]["linear_density_kg_per_m"]
+    windows_of(log)
+
+
+def test_quaternions_with_their_scalar_last_are_not_diagnosed():
+    log = copy.deepcopy(cases.recording())
+    log.gripper_pose[..., 3:] = np.roll(log.gripper_pose[..., 3:], -1, axis=-1)
+    with pytest.raises(ValueError, match=r"x axis of gripper|their scalar last"):
+        windows_of(log)
 
 
 def test_a_stated_damping_is_believed():
@@ -236,7 +254,7 @@ def test_labels_are_one_for_each_episode_or_none():
 
 def test_gravity_is_the_one_that_the_log_states():
     log = cases.recording()
-    gravity = [0.0, -9.81, 0.0]
+    gravity = [0.0, -4.0, -9.0]
     windows = windows_of(dataclasses.replace(log, meta={**log.meta, "gravity_m_per_s2": gravity}))
     layout = layout_of(windows, 0.02)
     np.testing.assert_allclose(layout.physics(layout.null).gravity, gravity, rtol=1e-6)

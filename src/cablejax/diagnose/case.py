@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from cablejax.arrays import positions_at
 from cablejax.cable import Discretisation
-from cablejax.cable_file import config_of_log
+from cablejax.cable_file import cable_of_log, config_of_log
 from cablejax.diagnose.actuation import Actuation, actuation
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.evidence import Evidence, repeated_motions
@@ -104,7 +104,7 @@ class Case:
         pose, scatter = _steadied(recording.gripper_pose, recording, arms)
         recording = dataclasses.replace(recording, gripper_pose=pose)
         config = config_of_log(log, n_links=FIT_LINKS)
-        marks = np.asarray(log.meta["keypoint_arclength_m"], float)
+        marks = cable_of_log(log).keypoint_arclength
         ends = recording.gripper_pose[:, 0, :, :2]
         first = [
             _at_uniform_marks(shape, marks, held) for shape, held in zip(first_shapes(recording), ends, strict=True)

@@ -13,7 +13,7 @@ from cablejax.diagnose.log_faults import as_measured, clock_offset, command_faul
 from cablejax.diagnose.noise import still
 from cablejax.gaplog import Episode, episodes_of, validate
 from cablejax.gaplog_join import commands_derived
-from cablejax.log_geometry import cable_fault
+from cablejax.log_setup import cable_fault
 from cablejax.types import GapLog
 
 # Samples are padded to a multiple of this, so that logs of nearly equal length share one compiled program.

@@ -14,7 +14,7 @@ from cablejax.cable import Cable
 from cablejax.cable_length import coordinate_noise, require_fitting_length
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.gaplog_join import COMMANDS_DERIVED
-from cablejax.log_geometry import setup_fault
+from cablejax.log_setup import setup_fault
 from cablejax.poses import twists
 from cablejax.recordings.take import Take, typical_spacing
 from cablejax.types import GapLog

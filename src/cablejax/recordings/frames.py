@@ -17,6 +17,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from cablejax.arrays import quaternion_product
+from cablejax.log_setup import LARGEST_TILT, QUATERNIONS, sags_from
 from cablejax.poses import rotated, unwrapped
 from cablejax.recordings.take import Take
 
@@ -25,17 +26,12 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
 """All six."""
 
-LARGEST_TILT = np.radians(50)
-"""Largest angle between the stated vertical and the direction in which the cable hangs."""
-
 ALONG = np.radians(45)
 """Largest angle between a gripper's x axis and the markers on it."""
 
 FLAT = 0.02
 """Height above or below the others that 99 % of the keypoints of a cable on a table keep within [m]."""
 
-ASKEW, _BETTER = np.radians(60), 3.0
-"""Both x axes farther off the cable were misread, if so many times nearer to it when read in another convention."""
 RIGID = np.radians(8)
 """Largest root-mean-square angle by which a pair of markers may turn against the gripper that it is on."""
 
@@ -144,17 +140,10 @@ def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
     Raises:
         ValueError: names the axis along which the cable hangs.
     """
-    # from the middle of the cable to the middle of its ends [m]; NaN where not all keypoints are observed
-    above = np.concatenate([take.keypoints[:, [0, -1]].mean(axis=1) - take.keypoints.mean(axis=1) for take in takes])
-    above = above[np.isfinite(above).all(axis=1)]
-    mean = above.mean(axis=0) if len(above) else np.zeros(3)
-    size = np.linalg.norm(mean)
-    # A cable that is stretched or swirled around does not say where up is.
-    if size < 0.3 * np.sqrt((above**2).sum(axis=1).mean() if len(above) else 1.0):
+    above = sags_from(np.concatenate([take.keypoints for take in takes]))
+    if above is None or np.arccos(np.clip(above[2], -1, 1)) <= LARGEST_TILT:
         return
-    if np.arccos(np.clip(mean[2] / size, -1, 1)) <= LARGEST_TILT:
-        return
-    up = frame.matrix.T @ mean
+    up = frame.matrix.T @ above
     axis = int(np.argmax(abs(up)))
     found = ("" if up[axis] > 0 else "-") + "xyz"[axis]
     raise ValueError(
@@ -216,32 +205,6 @@ def require_along_x(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...])
         )
 
 
-def require_readable(takes: tuple[Take, ...]) -> None:
-    """Rejects orientations whose x axes fit the cable far better if their quaternions are read in another way.
-
-    For grippers with one keypoint on each: the next is on the cable, whose bend hides all but a gross mistake.
-
-    Raises:
-        ValueError: says how far both are off, and in what other convention they would fit.
-    """
-    last = takes[0].keypoints.shape[1] - 1
-    seen = [_seen(takes, 0, 0, 1), _seen(takes, 1, last - 1, last)]
-
-    def off(change) -> np.ndarray:
-        along = (rotated(_inverse(q), d)[:, 0] for q, d in (change(*one) for one in seen if one is not None))
-        return np.array([np.median(np.arccos(np.clip(one, -1, 1))) for one in along if len(one)])
-
-    stated = off(lambda quaternion, direction: (quaternion, direction))
-    for name, change in _QUATERNIONS.items():
-        if len(stated) == 2 and (stated > ASKEW).all() and (off(change) < stated / _BETTER).all():
-            (one, other), (better, well) = np.degrees(stated), np.degrees(off(change))
-            raise ValueError(
-                f"The x axes of grippers 0 and 1 are {one:.0f} and {other:.0f} degrees off the cable next to them "
-                f"(median), and {better:.0f} and {well:.0f} if {name}: expected qw, qx, qy, qz of a gripper whose x "
-                "axis is along the cable. Correct the order of their numbers."
-            )
-
-
 def _seen(takes: tuple[Take, ...], gripper: int, first: int, second: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Orientations of a gripper, and the directions of its markers, where both were observed; None without poses."""
     posed = [take for take in takes if take.gripper_pose is not None]
@@ -280,12 +243,12 @@ def _exchanged(a: int, b: int):
     return lambda quaternion, direction: (quaternion, direction[:, order])
 
 
-_QUATERNIONS = {
-    "the quaternions have their scalar last": lambda quaternion, direction: (np.roll(quaternion, 1, axis=1), direction),
-    "the quaternions are inverted": lambda quaternion, direction: (_inverse(quaternion), direction),
-}
+def _reread(read):
+    return lambda quaternion, direction: (read(quaternion), direction)
+
+
 _CONVENTIONS = {
-    **_QUATERNIONS,
+    **{name: _reread(read) for name, read in QUATERNIONS.items()},
     **{
         f"the positions are mirrored along {name}, as from a left-handed frame": _mirrored(k)
         for k, name in enumerate("xyz")

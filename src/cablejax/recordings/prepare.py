@@ -16,7 +16,6 @@ from cablejax.recordings.frames import (
     onto_table,
     require_along_x,
     require_hanging,
-    require_readable,
     require_rigid,
 )
 from cablejax.recordings.gaps import cut_at_gaps
@@ -83,12 +82,10 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     last = takes[0].keypoints.shape[1] - 1
     pairs = ((0, 1), (last - 1, last))
     takes = _noted(cut_at_gaps(takes, None if measured else (*pairs[0], *pairs[1])), repairs)
-    if measured and takes[0].keypoints.shape[2] == 3:
-        if setup.on_grippers == "pairs":
-            require_rigid(takes, pairs)
-            require_along_x(takes, pairs)
-        else:
-            require_readable(takes)
+    # with one keypoint on each gripper the assembled log is checked
+    if measured and takes[0].keypoints.shape[2] == 3 and setup.on_grippers == "pairs":
+        require_rigid(takes, pairs)
+        require_along_x(takes, pairs)
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
     return takes, [*repairs, *_jerks(takes)]

@@ -15,7 +15,7 @@ from cablejax.control.link_state import Reply, Status
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.run_log import RunLog, motion
 from cablejax.gaplog import GapLogError, write_gap_log
-from cablejax.log_geometry import setup_fault
+from cablejax.log_setup import setup_fault
 from cablejax.simulate.table_plant import Observation
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file

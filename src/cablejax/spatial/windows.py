@@ -13,7 +13,7 @@ from cablejax.cable_length import TOLERANCE, require_fitting_length
 from cablejax.diagnose.log_faults import steadied
 from cablejax.diagnose.noise import noise_floor
 from cablejax.gaplog import labels
-from cablejax.log_geometry import cable_fault
+from cablejax.log_setup import cable_fault
 from cablejax.poses import rotated
 from cablejax.recordings.gaps import FILLED, bridged
 from cablejax.spatial.grips import clamps, frames_of, held_keypoints, rolls_observed
