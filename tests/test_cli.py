@@ -139,7 +139,7 @@ def test_simulate_says_its_result_as_json_and_repeats_it(tmp_path, capsys):
 
 
 def test_simulate_advises_to_train_only_where_that_is_possible(tmp_path, capsys):
-    arguments = ["simulate", "--trajectories", "1", "--steps", "2", "--links", "5"]
+    arguments = ["simulate", "--trajectories", "2", "--steps", "2", "--links", "5"]
     assert main([*arguments, "--out", str(tmp_path / "even cable")]) == 0
     assert f"cablejax train --data '{tmp_path / 'even cable'}'" in capsys.readouterr().out
     write_cable(tmp_path / "cable.toml", Cable(n_keypoints=4, marks=(0.0, 0.2, 0.7, 1.0)))
@@ -153,6 +153,16 @@ def test_simulate_refuses_a_folder_that_holds_something_else(tmp_path, capsys):
     assert main(["simulate", "--out", str(tmp_path), "--overwrite"]) == 2
     assert "holds no data set" in capsys.readouterr().err
     assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_data_set_is_not_overwritten_with_files_of_the_user_in_it(tmp_path, capsys):
+    simulate = ["simulate", "--trajectories", "1", "--links", "5", "--out", str(tmp_path / "data"), "--overwrite"]
+    assert main([*simulate, "--steps", "1"]) == 0
+    (tmp_path / "data" / "notes.txt").write_text("mine")
+    assert main([*simulate, "--steps", "2"]) == 2
+    assert "data holds notes.txt besides a data set" in capsys.readouterr().err
+    (tmp_path / "data" / "notes.txt").unlink()
+    assert main([*simulate, "--steps", "2"]) == 0
 
 
 def test_output_folder_that_exists_is_refused_unless_overwritten(tmp_path):

@@ -1,5 +1,6 @@
 """`cablejax shape` and `cablejax demo` on a short run of a coarse plant: what they write, refuse and resume."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -88,6 +89,21 @@ def test_a_motion_that_is_played_leaves_no_page_of_an_earlier_run_next_to_its_lo
         (out / name).write_text("of another run")
     assert main(["shape", "--motion", str(motion), "--links", "8", "--out", str(out), "--overwrite"]) == 0
     assert sorted(path.name for path in out.iterdir()) == ["log.npz", "notes.txt"]
+
+
+def test_a_motion_at_thirty_hertz_is_played_and_one_without_commands_refused(tmp_path, capsys):
+    poses = np.repeat(straight_start(Cable())[None], 7, axis=0)
+    poses[:, 1, 0] -= 0.01 * np.arange(7) / 6
+    log = commands_log({"closer": poses}, 1 / 30, Cable())
+    write_gap_log(tmp_path / "motion.npz", log)
+    write_gap_log(tmp_path / "still.npz", dataclasses.replace(log, gripper_command=np.zeros_like(log.gripper_command)))
+    play = ["shape", "--links", "8", "--out", str(tmp_path / "run"), "--motion"]
+    assert main([*play, str(tmp_path / "motion.npz")]) == 0
+    played = read_gap_log(tmp_path / "run" / "log.npz")
+    np.testing.assert_allclose(played.time, log.time, atol=1e-8)
+    np.testing.assert_allclose(played.gripper_pose, log.gripper_pose, atol=1e-4)
+    assert main([*play, str(tmp_path / "still.npz"), "--overwrite"]) == 2
+    assert "The motion has no commands, but its grippers move by 0.01 m" in capsys.readouterr().err
 
 
 def test_a_motion_that_cannot_be_played_leaves_no_empty_folder(tmp_path, capsys):

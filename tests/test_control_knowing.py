@@ -72,6 +72,22 @@ def test_the_controller_of_every_released_model_takes_a_history(name):
     assert (state.history.cable is not None) == released.config.conditioned
 
 
+def test_a_model_is_not_informed_of_what_acts_for_a_time(model):
+    with pytest.raises(ValueError, match=r"from_s=5.* acts for a time, but a model is informed of what acts all"):
+        knowing(model, (parse_effect(f"{CURVED},from_s=5"),))
+
+
+def test_what_the_limits_of_a_conditioned_model_leave_out():
+    conditioned = load_model("gns-conditioned")
+    low, high = conditioned.inputs.limits[0]
+    for ratio, left in ((1.5, 0.0), (50.0, 1.0)):
+        effects = (parse_effect(f"bending_stiffness:ratio={ratio}"),)
+        out = conditioned.inputs.left_out(effects, conditioned.cable)
+        beyond = np.log(ratio) - (knowing(conditioned, effects).believed[0] - conditioned.believed[0])
+        assert low < high and (out > 0) == (left > 0)
+        np.testing.assert_allclose(out, beyond, atol=1e-6)
+
+
 def test_informed_of_nothing_a_model_is_as_it_was(model):
     same = knowing(model, ())
     assert same.config == model.config and same.dynamics == model.dynamics and same.known == ()

@@ -7,6 +7,7 @@ two objects go into simulators, data sets, trained weights and logs, so that any
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, Literal
 
 import numpy as np
@@ -147,6 +148,10 @@ class Discretisation:
     def n_joints(self) -> int:
         """Number of bending joints J."""
         return self.n_links - 1
+
+    def dividing(self, interval: float) -> Discretisation:
+        """The same with the largest time step, at most its own, of which an interval [s] is a multiple."""
+        return dataclasses.replace(self, timestep=interval / math.ceil(interval / self.timestep * (1 - 1e-6)))
 
     def steps_in(self, interval: float, name: str = "The interval") -> int:
         """Number of time steps in an interval [s]. Raises `ValueError` if it is not a whole number."""

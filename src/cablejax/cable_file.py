@@ -120,8 +120,12 @@ def cable_from_fields(fields: Mapping[str, Any], where: str) -> Cable:
         where: what they come from, for messages.
 
     Raises:
-        ValueError: a key is unknown or missing, or a value is not possible; names the key.
+        ValueError: this is no object, a key is unknown or missing, or a value is not possible; names the key.
     """
+    if not isinstance(fields, Mapping):
+        raise ValueError(
+            f"{where} is {shown(fields)}, expected a cable with the keys {', '.join([*NUMBERS, *OTHERS])}."
+        )
     for key in fields:
         if key not in NUMBERS and key not in OTHERS:
             raise ValueError(f"{where} has {unknown_key(key, _UNITS)}")
@@ -172,7 +176,9 @@ def config_of_log(log: GapLog, *, n_links: int | None = None, timestep: float | 
     In the plane the diameter hardly matters to the motion, and a cable thicker than a link is long gets a smaller one.
     """
     dimension, chosen = log.keypoints.shape[-1], {"n_links": n_links, "timestep": timestep}
-    stated = {**_OPTIONAL, **log.meta["cable"], "friction_coefficient": 0.0, **(log.meta["table"] or {})}
+    stated = {**_OPTIONAL, **log.meta["cable"], "friction_coefficient": 0.0}
+    if log.meta["table"] is not None:
+        stated["friction_coefficient"] = log.meta["table"]["friction_coefficient"]
     numbers = {name: stated[key] for key, (name, _) in NUMBERS.items()}
     if dimension == 2:
         numbers["diameter"] = min(numbers["diameter"], _SLENDER * numbers["length"])

@@ -5,12 +5,10 @@ Files are read without unpickling, checked field by field, and written whole or 
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import json
 import os
 import pathlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,7 @@ from cablejax.cable_file import NUMBERS
 from cablejax.gaplog_check import DTYPES, META_FIELDS, SCHEMA, GapLogError, validate
 from cablejax.limits import LIMITS, require
 from cablejax.npz import NpzError, read_npz
-from cablejax.text_file import parse_json
+from cablejax.text_file import json_text, parse_json
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
 
@@ -93,19 +91,6 @@ def gap_log_from_episodes(
     )
 
 
-@contextlib.contextmanager
-def reading_export(path: os.PathLike[str]) -> Iterator[None]:
-    """Turns the various errors that libraries raise on a damaged export into one that names the file or folder."""
-    try:
-        yield
-    except GapLogError as error:
-        raise GapLogError(f"{path}: {error}") from error
-    except Exception as error:
-        raise GapLogError(
-            f"{path} could not be read ({type(error).__name__}: {error}). Export the log again."
-        ) from error
-
-
 def stack_episodes(episodes: Sequence[Episode], meta: Mapping[str, Any], *, holds: bool = True) -> GapLog:
     """Stacks episodes, padded to the longest, to a checked gap log: the inverse of `episodes_of`.
 
@@ -120,9 +105,17 @@ def stack_episodes(episodes: Sequence[Episode], meta: Mapping[str, Any], *, hold
     lengths = [len(episode.time) for episode in episodes]
 
     def padded(name: str, fill) -> np.ndarray:
-        arrays = [np.asarray(getattr(episode, name)) for episode in episodes]
+        given = [getattr(episode, name) for episode in episodes]
+        if any(map(np.ma.is_masked, given)):
+            raise GapLogError(
+                f"An episode's {name} is a masked array, whose mask a log does not have: write NaN for keypoints that "
+                "were not observed (array.filled(np.nan)), and leave out samples without the rest."
+            )
+        arrays = [np.asarray(array) for array in given]
         rest = arrays[0].shape[1:]
         for array, length in zip(arrays, lengths, strict=True):
+            if not length:
+                raise GapLogError("An episode has no sample, expected at least one.")
             if array.shape != (length, *rest):
                 raise GapLogError(
                     f"An episode's {name} has shape {array.shape}, expected {(length, *rest)}: all arrays of an "
@@ -195,7 +188,7 @@ def write_gap_log(
         simulated: keypoints of simulators on this log [m], by the names in `SIMULATED`, for `read_simulated`.
 
     Raises:
-        GapLogError: the log does not follow the format.
+        GapLogError: the log does not follow the format, or has a field that JSON cannot hold.
         FileExistsError: there is such a file and `overwrite` is false.
     """
     path = pathlib.Path(path)
@@ -205,10 +198,20 @@ def write_gap_log(
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: choose another name, or pass overwrite=True to replace it.")
     arrays = {name: getattr(log, name) for name in DTYPES if getattr(log, name) is not None}
-    arrays |= {name: np.asarray(points, np.float32) for name, points in (simulated or {}).items()}
+    for name, points in (simulated or {}).items():
+        if name not in SIMULATED or np.shape(points) != log.keypoints.shape:
+            raise GapLogError(
+                f"The simulated keypoints {name!r} have shape {np.shape(points)}, expected {' or '.join(SIMULATED)} "
+                f"of shape {log.keypoints.shape}."
+            )
+        arrays[name] = np.asarray(points, np.float32)
+    try:
+        meta = json_text(log.meta)
+    except ValueError as error:
+        raise GapLogError(f"Field 'meta' cannot be written: {error}") from None
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as stream:
-        np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(log.meta)), **arrays)
+        np.savez_compressed(stream, allow_pickle=False, meta=np.array(meta), **arrays)
     return path
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import difflib
 import math
+import os
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,7 +15,7 @@ from jaxtyping import Float
 from cablejax.cable_file import NUMBERS, cable_from_fields
 from cablejax.limits import LIMITS, require, shown
 from cablejax.log_geometry import geometry_fault
-from cablejax.text_file import version_of
+from cablejax.text_file import unknown_key, version_of
 from cablejax.types import GapLog
 
 SCHEMA = "cablejax-gap-log/1"
@@ -34,12 +38,28 @@ META_FIELDS = (
 _ENDS = 0.05
 # Of the samples on an even clock of its usual interval, an episode has at least one in so many.
 _LOST = 20
+_FRICTION = "friction_coefficient"
+# How alike the spellings of two keys are that mean one, see `difflib`.
+_NEARLY = 0.8
 # Columns of a pose and of a twist, by the dimension of the keypoints.
 _POSE_WIDTH, _TWIST_WIDTH = {2: 3, 3: 7}, {2: 3, 3: 6}
 
 
 class GapLogError(ValueError):
     """A gap log that violates the format."""
+
+
+@contextlib.contextmanager
+def reading_export(path: os.PathLike[str]) -> Iterator[None]:
+    """Turns the various errors that libraries raise on a damaged export into one that names the file or folder."""
+    try:
+        yield
+    except GapLogError as error:
+        raise GapLogError(f"{path}: {error}") from error
+    except Exception as error:
+        raise GapLogError(
+            f"{path} could not be read ({type(error).__name__}: {error}). Export the log again."
+        ) from error
 
 
 def validate(log: GapLog) -> None:
@@ -69,7 +89,8 @@ def _validate_arrays(log: GapLog) -> None:
             f"Field 'keypoints' has shape {log.keypoints.shape}, expected at least one episode and two keypoints: the "
             "first and the last are at the grippers."
         )
-    grippers = log.gripper_pose.shape[2] if log.gripper_pose.ndim == 4 else 2
+    # any number of grippers but none
+    grippers = max(log.gripper_pose.shape[2], 1) if log.gripper_pose.ndim == 4 else 2
     shapes = {
         "time": (episodes, samples),
         "gripper_pose": (episodes, samples, grippers, _POSE_WIDTH[dimension]),
@@ -148,6 +169,11 @@ def _validate_meta(log: GapLog) -> None:
             f"Field 'meta.keypoint_arclength_m' goes from {marks[0]:g} to {marks[-1]:g} m, expected 0 to the cable's "
             f"length of {cable_length:g} m: the first and the last keypoint are at the grippers."
         )
+    if not (marks[1:-1] > 0.0).all() or not (marks[1:-1] < cable_length).all():
+        raise ValueError(
+            "Field 'meta.keypoint_arclength_m' has keypoints beyond the cable: expected all within 0 to "
+            f"{cable_length:g} m."
+        )
     for name, length in (("grasp", grippers), ("motion", len(log.episode_length))):
         value = meta[name]
         if not isinstance(value, list) or len(value) != length or not all(isinstance(entry, str) for entry in value):
@@ -158,9 +184,17 @@ def _validate_meta(log: GapLog) -> None:
 
 def _check_cable(meta: dict[str, Any], points: int) -> None:
     """Raises unless the cable and its table could exist."""
-    cable, table = meta["cable"], {"friction_coefficient": 0.0} if meta["table"] is None else meta["table"]
+    cable, table = meta["cable"], {_FRICTION: 0.0} if meta["table"] is None else meta["table"]
     for name, value in (("cable", cable), ("table", table)):
         if not isinstance(value, dict):
             raise ValueError(f"Field 'meta.{name}' is {shown(value)}, expected an object.")
-    known = {key: value for key, value in {**cable, **table}.items() if key in NUMBERS}
+    if strangers := [key for key in table if key in NUMBERS and key != _FRICTION]:
+        raise ValueError(f"Field 'meta.table' has {', '.join(strangers)}, which belongs into 'meta.cable'.")
+    known = {key: value for key, value in cable.items() if key in NUMBERS and key != _FRICTION}
+    lacking = {key: LIMITS[name].unit for key, (name, _) in NUMBERS.items() if key not in {**known, _FRICTION: None}}
+    for key in cable:
+        # a new field may be added, but one that is nearly of the cable was meant to be
+        if key not in NUMBERS and difflib.get_close_matches(key, lacking, 1, _NEARLY):
+            raise ValueError(f"Field 'meta.cable' has {unknown_key(key, lacking)}")
+    known |= {key: value for key, value in table.items() if key == _FRICTION}
     cable_from_fields({**known, "keypoints": points}, "Field 'meta.cable' or 'meta.table'")

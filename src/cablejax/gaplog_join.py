@@ -175,7 +175,7 @@ def _of_one_length(logs: Sequence[GapLog]) -> Sequence[GapLog]:
 def _guessed(log: GapLog) -> list[Any]:
     """Names of the cable's values that were guessed; another program may mean something else by this field."""
     names = log.meta.get("guessed")
-    return names if isinstance(names, list) else []
+    return names if isinstance(names, list) and all(isinstance(name, str) for name in names) else []
 
 
 def _labels(logs: Sequence[GapLog], names: Sequence[str], field: str) -> list[Any] | None:
@@ -205,11 +205,11 @@ def chosen(log: GapLog, episodes: Sequence[int]) -> GapLog:
     Raises:
         GapLogError: numbers that the log does not have, or in another order.
     """
-    total, numbers = len(log.episode_length), list(episodes)
+    total, numbers = len(log.episode_length), list(episodes) if np.ndim(episodes) else []
     whole = all(number in LIMITS["count_from_zero"] for number in numbers)
     if not numbers or not whole or numbers != sorted({*numbers} & {*range(total)}):
         raise GapLogError(
-            f"The episodes {shown(numbers)} were asked for, expected increasing numbers below {total}, whole ones."
+            f"The episodes {shown(episodes)} were asked for, expected increasing numbers below {total}, whole ones."
         )
     meta = dict(log.meta)
     for name, value in log.meta.items():

@@ -93,7 +93,8 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         # since 1970 or since a start
         "stamp": Limit(0.0, 1e10, "s"),
         # bounds of a motion
-        "place": Limit(-1e3, 1e3, "m"),
+        # those in millimetres are beyond
+        "place": Limit(-100.0, 100.0, "m"),
         "gripper_speed": Limit(1e-4, 10.0, "m/s"),
         "turn_rate": Limit(1e-3, 100.0, "rad/s"),
         "bend_radius": Limit(1e-4, 10.0, "m"),

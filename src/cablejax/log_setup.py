@@ -39,9 +39,9 @@ _HANGS = 6.0
 def cable_fault(log: GapLog) -> str | None:
     """Finds a set-up that is not simulated, or that another unit, sign or axis explains far better; a message, or None.
 
-    A grasp other than a clamp; keypoints that are not at the grippers, or as far apart as no cable of this length; a
-    gripper's angle that is dead, in another unit or of the other sign; quaternions whose x axis is not along the cable;
-    gravity that points away from where the cable hangs.
+    A grasp other than a clamp; a rest curvature in space, which has no direction there; keypoints that are not at the
+    grippers, or as far apart as no cable of this length; a gripper's angle that is dead, in another unit or of the
+    other sign; quaternions whose x axis is not along the cable; gravity that points away from where the cable hangs.
 
     Args:
         log: valid; between two grippers, else nothing is checked.
@@ -53,6 +53,11 @@ def cable_fault(log: GapLog) -> str | None:
         return (
             f'Field \'meta.grasp\' is {log.meta["grasp"]}, expected ["clamped", "clamped"], the only grasp simulated. '
             "State this for grippers that yield too, which a diagnosis on a table finds (`gripper_compliance`)."
+        )
+    if log.in_space and (curved := log.meta["cable"].get("rest_curvature_per_m", 0.0)):
+        return (
+            f"Field 'meta.cable.rest_curvature_per_m' is {curved:g}, which says in no direction of space: state 0. The "
+            "diagnosis finds the curvature by the effect intrinsic_curvature (--only)."
         )
     points, pose = log.keypoints[log.valid].astype(float), log.gripper_pose[log.valid].astype(float)
     grippers = pose[..., :dimension]

@@ -10,6 +10,8 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from cablejax.limits import require, shown
 from cablejax.whole_file import whole_file
 
@@ -18,10 +20,28 @@ def write_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
     """Writes a JSON file whole or not at all.
 
     Raises:
-        ValueError: a number is not finite, for which JSON has no word.
+        ValueError: a number is not finite, or something else for which JSON has no word.
     """
+    text = json_text(value, indent=2, allow_nan=False)
     with whole_file(path) as stream:
-        stream.write((json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+        stream.write(f"{text}\n".encode())
+
+
+def json_text(value: Mapping[str, Any], **options: Any) -> str:
+    """JSON of an object, NumPy's numbers and arrays included.
+
+    Half of a character, as the name of a Latin-1 file has, becomes a question mark, since `parse_json` refuses it.
+
+    Raises:
+        ValueError: something for which JSON has no word.
+    """
+
+    def plain(one: Any) -> Any:
+        if isinstance(one, (np.ndarray, np.generic)):
+            return one.tolist()
+        raise ValueError(f"{shown(one)} is a {type(one).__name__}, expected what JSON has: text, numbers, lists.")
+
+    return json.dumps(value, default=plain, ensure_ascii=False, **options).encode(errors="replace").decode()
 
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -75,7 +75,8 @@ def draft_folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
                         shutil.rmtree(old, ignore_errors=True)
     draft = path.parent / f".{path.name}.{uuid.uuid4().hex}.draft"
     try:
-        yield draft
+        with naming(path):
+            yield draft
     finally:
         shutil.rmtree(draft, ignore_errors=True)
 

@@ -155,7 +155,9 @@ def _described(path: pathlib.Path, log: GapLog, repairs: Sequence[str]) -> tuple
         "repairs": list(repairs),
     }
     line = (
-        f"{path}: {counted(len(log.keypoints), 'episode')}, {counted(len(points), 'sample')} of {points.shape[1]} "
+        f"{path}: {counted(len(log.keypoints), 'episode')}, {counted(len(points), 'sample')} "
+        f"({float(log.intervals.sum()):.4g} s at {1 / np.median(log.intervals):.4g} Hz) "
+        f"of {points.shape[1]} "
         f"keypoints in {'space' if log.in_space else 'the plane'}, {100 * seen:.4g} % of them observed; the cable is "
         f"{length:.4g} m long."
     )

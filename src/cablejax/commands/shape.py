@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import pathlib
 import shlex
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -10,12 +11,15 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from cablejax.commands.cable import find_cable
-from cablejax.commands.options import Command, UsageError, text_table
+from cablejax.commands.options import Command, UsageError, say, text_table
 from cablejax.limits import require
 from cablejax.solver_names import SolverName
 
 if TYPE_CHECKING:
     from cablejax.effects.given import GivenEffect
+
+# Log ratio of stiffness to friction that a model may miss without a word.
+_LEFT_OUT = 0.01
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -96,6 +100,12 @@ class Shape(Command):
         model = load_model(self.weights)
         if known := known_from(model, self.effect, self.with_):
             model = knowing(model, known)
+            out = model.inputs.left_out(known, model.cable) if model.config.conditioned else 0.0
+            if abs(out) > _LEFT_OUT:
+                say(
+                    f"The model's training data had no cable like this one: it is informed of {math.exp(-out):.2g} "
+                    "times the ratio of stiffness to friction that the effects make, the nearest in its data."
+                )
         cable = model.cable if self.cable is None else find_cable(self.cable)
         plant = plant_of(
             cable,
@@ -145,6 +155,10 @@ class Shape(Command):
                 "which it may tear or fold: give a cable of that length, or leave --cable out."
             )
         plant = plant_of(cable, effects, links=self.links, seed=self.seed)
+        if len(commands.intervals):
+            # a motion at 30 Hz, of which no time step of the plant is a part
+            usual = plant.discretisation.dividing(round(float(commands.intervals[0]), 9))
+            plant = dataclasses.replace(plant, discretisation=usual)
         noise = 1e-3 * (self.noise_mm or 0.0)
         settings = {"motion": commands.meta, "plant": dataclasses.asdict(plant), "noise": noise}
         with unfinished(self.out, settings, overwrite=self.overwrite):

@@ -166,15 +166,24 @@ class Simulate(Command):
 
 
 def _clear(place: pathlib.Path | Bucket, config: DatasetConfig) -> None:
-    """Deletes a data set of another configuration; refuses whatever is no data set, or is being written."""
+    """Deletes a data set of another configuration; refuses what is none, holds other files, or is being written."""
     from cablejax.dataset.bucket import Bucket
     from cablejax.dataset.generate import WRITER
     from cablejax.dataset.opening import open_store
 
+    bucket = isinstance(place, Bucket)
+    names = place.names() if bucket else [file.name for file in place.iterdir()] if place.is_dir() else []
+    if not names or (old := open_store(str(place))).config == config:
+        return
+    others = {name.partition("/")[0] for name in names} - old.names
+    if others := sorted(name for name in others if not name.startswith(WRITER)):
+        raise UsageError(
+            f"{place} holds {', '.join(others[:5])} besides a data set, which --overwrite would delete with it. Move "
+            "the rest elsewhere, or give another place with --out."
+        )
     if isinstance(place, Bucket):
-        if (names := place.names()) and open_store(str(place)).config != config:
-            place.remove(names)
-    elif place.is_dir() and any(place.iterdir()) and open_store(place).config != config:
+        place.remove(names)
+    else:
         for writer in place.glob(f"{WRITER}*"):
             with sole_writer(writer):
                 pass

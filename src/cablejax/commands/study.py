@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import pathlib
 import shutil
 from typing import TYPE_CHECKING, ClassVar
@@ -152,7 +153,10 @@ def remove_rounds(out: pathlib.Path, kept: int) -> None:
     """Deletes all rounds after those that are kept, of an overwritten, damaged or longer study."""
     for old in ("report.html", "summary.json"):
         (out / old).unlink(missing_ok=True)
-    for path in (*out.glob("recording_*.npz"), *out.glob("round_*")):
-        number = path.stem.rpartition("_")[2]
-        if number.isdecimal() and int(number) > kept:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for number in itertools.count(kept + 1):
+        folder = out / f"round_{number}"
+        # the first one may have been left by a kill; others of such names, without a verdict, are the user's
+        if number > kept + 1 and not (folder / "verdict.json").is_file():
+            return
+        (out / f"recording_{number}.npz").unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)

@@ -68,6 +68,7 @@ class Train(Command):
 
     def execute(self):
         """Trains, from a checkpoint where there is one, and reports the open-loop error."""
+        from cablejax.control.cable_inputs import inputs_of_data
         from cablejax.dataset.opening import open_store
         from cablejax.dataset.split import read_split
         from cablejax.dataset.windows import concatenate
@@ -83,6 +84,11 @@ class Train(Command):
             require(self.lr, "learning_rate", "--lr")
         stores = [open_store(path) for path in self.data]
         self._check_cables(stores)
+        if self.conditioned and all(low == high for low, high in inputs_of_data(stores, self.held_out).limits):
+            say(
+                "All cables of the data are equally stiff and rough, so a conditioned network learns nothing of its "
+                "inputs: simulate with --stiffness-range or --friction-range, or leave --conditioned out."
+            )
         asymmetric = sorted({name for store in stores for name in store.config.asymmetric})
         config = self._config(stores[0], flips=not asymmetric)
         if asymmetric and self.symmetric:

@@ -54,11 +54,20 @@ class CableInputs:
         In slow motion only the ratio of stiffness and friction matters: what is beyond a limit of one is taken up by
         the other.
         """
-        nominal, changed = inputs_of((), cable), inputs_of(effects, cable)
-        stiffness, friction = np.where(changed == nominal, self.mean, changed)
+        stiffness, friction = self._asked(effects, cable)
         softest_to_stiffest, smoothest_to_roughest = self.limits
         within = np.clip(friction, *smoothest_to_roughest)
         return float(np.clip(stiffness - (friction - within), *softest_to_stiffest)), float(within)
+
+    def left_out(self, effects: Sequence[GivenEffect], cable: Cable) -> float:
+        """Log ratio of stiffness to friction that effects make and the limits leave out of `with_effects`."""
+        (stiffness, friction), within = self._asked(effects, cable), self.with_effects(effects, cable)
+        return float(stiffness - friction) - (within[0] - within[1])
+
+    def _asked(self, effects: Sequence[GivenEffect], cable: Cable) -> np.ndarray:
+        """The inputs of a cable with effects, shape [2], whatever the limits."""
+        nominal, changed = inputs_of((), cable), inputs_of(effects, cable)
+        return np.where(changed == nominal, self.mean, changed)
 
 
 def inputs_of(effects: Sequence[GivenEffect], cable: Cable) -> np.ndarray:

@@ -126,9 +126,14 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
     data. What else they do is left to the network and to what is learned online.
 
     Raises:
-        ValueError: nothing of the effects enters the model, or it was trained on one that is none of its inputs, and
-            would have it twice; names the ways that remain.
+        ValueError: nothing of the effects enters the model, one acts for a time only, or the model was trained on one
+            that is none of its inputs, and would have it twice; names the ways that remain.
     """
+    if passing := [str(one) for one in effects if not one.lasting]:
+        raise ValueError(
+            f"{', '.join(passing)} acts for a time, but a model is informed of what acts all the time: leave from_s "
+            "and until_s out."
+        )
     trained = {text.partition(":")[0].partition(" ")[0] for text in model.effects}
     twice = [str(one) for one in effects if one.name in trained and not _input_alone(model, one)]
     if twice:

@@ -127,8 +127,13 @@ class DatasetConfig:
 
     @property
     def trainable(self) -> bool:
-        """Whether models are trained on such data: without `untrainable` effects, with evenly spaced keypoints."""
-        return not self.untrainable and self.cable.marks is None
+        """Whether models are trained on such data.
+
+        Without `untrainable` effects, with at least three keypoints, evenly spaced, and two trajectories, of which one
+        is held out.
+        """
+        spaced = self.cable.marks is None and self.cable.n_keypoints in LIMITS["at_least_three"]
+        return spaced and not self.untrainable and self.n_trajectories > 1
 
     @property
     def effect_names(self) -> frozenset[str]:

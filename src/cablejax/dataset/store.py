@@ -69,6 +69,11 @@ class Store:
     versions: dict[str, str]
     group: zarr.Group
 
+    @property
+    def names(self) -> set[str]:
+        """What a store holds at its top, besides its writers' locks."""
+        return {"zarr.json", *self.config.array_shapes(), "digest"}
+
     def status(self, shard: int) -> Literal["missing", "complete", "corrupt"]:
         """Whether a shard is on disk and intact: reads it and compares the digests."""
         try:

@@ -118,6 +118,8 @@ def recorded_arrays(observed: ArrayLike, interval: ArrayLike) -> tuple[np.ndarra
     Raises:
         ValueError: arrays that are no recording.
     """
+    if np.ma.is_masked(observed):
+        raise ValueError("observed is a masked array, expected NaN where nothing was observed: array.filled(np.nan).")
     given = np.asarray(observed)
     if given.dtype.kind not in "fiu":
         raise ValueError(f"observed is an array of {given.dtype}, expected real numbers.")

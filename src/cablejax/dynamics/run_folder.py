@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,8 @@ RUN, CHECKPOINTS, METRICS, BOARD = "run.json", "checkpoints", "metrics.csv", "te
 PACKAGES = ("jax", "jaxlib", "flax", "optax")
 """Packages whose versions decide the weights, besides cablejax itself."""
 
+# Fields that are fitted to the data.
+_SCALES = "config.model.normalisation"
 # What `cablejax train` adds in the end.
 _RESULTS = ("weights.safetensors", "card.md", "summary.json")
 
@@ -61,10 +63,9 @@ def claim_folder(
                 )
             return
         if not overwrite:
-            changes = ", ".join(f"{name} ({old}, now {new})" for name, (old, new) in differences(found, run).items())
             raise ValueError(
-                f"{out_dir} holds a training that differs in {changes}. Choose another "
-                "folder, repeat it with the same configuration and data, or overwrite it (--overwrite)."
+                f"{out_dir} holds a training that differs in {_changes(found, run)}. Choose another folder, repeat it "
+                "with the same configuration and data, or overwrite it (--overwrite)."
             )
         _discard(out_dir)
     elif holds_anything(out_dir):
@@ -82,6 +83,17 @@ def claim_folder(
         _discard(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
     write_json(path, {**run, "versions": versions})
+
+
+def _changes(found: Mapping[str, Any], run: Mapping[str, Any]) -> str:
+    """In what two trainings differ, in words where their values tell a reader nothing."""
+    other = differences(found, run)
+    words = []
+    if other.pop("data", None):
+        words = ["its data, or what is held out of them (--data, --held-out, --buffer)"]
+        # the scales are those of the data
+        other = {name: values for name, values in other.items() if not name.startswith(_SCALES)}
+    return ", ".join([*(f"{name} ({old}, now {new})" for name, (old, new) in other.items()), *words])
 
 
 def _read(path: Path) -> dict[str, Any]:

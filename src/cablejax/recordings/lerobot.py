@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from cablejax.extras import from_extra
-from cablejax.gaplog import Episode, episodes_of, reading_export, stack_episodes
-from cablejax.gaplog_check import SCHEMA, GapLogError
+from cablejax.gaplog import Episode, episodes_of, stack_episodes
+from cablejax.gaplog_check import SCHEMA, GapLogError, reading_export
 from cablejax.limits import require
 from cablejax.text_file import read_json, write_json
 from cablejax.types import GapLog

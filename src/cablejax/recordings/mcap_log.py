@@ -23,8 +23,8 @@ import numpy as np
 
 from cablejax import __version__
 from cablejax.extras import from_extra
-from cablejax.gaplog import Episode, episodes_of, reading_export, stack_episodes
-from cablejax.gaplog_check import SCHEMA, GapLogError
+from cablejax.gaplog import Episode, episodes_of, stack_episodes
+from cablejax.gaplog_check import SCHEMA, GapLogError, reading_export
 from cablejax.limits import require
 from cablejax.simulate.pose import points_in_space, pose_in_space
 from cablejax.types import GapLog

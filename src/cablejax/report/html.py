@@ -24,7 +24,7 @@ def write_html(path: str | os.PathLike[str], template: str, **values: Any) -> No
     """Writes a template filled in; strings are escaped unless they are `Markup`."""
     page = _environment().get_template(template).render(**values)
     with whole_file(pathlib.Path(path)) as stream:
-        stream.write(page.encode())
+        stream.write(page.encode(errors="replace"))
 
 
 @functools.cache

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.log_geometry import gripper_motion
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.table_plant import TablePlant
 from cablejax.types import GapLog
@@ -28,8 +29,8 @@ def play(plant: TablePlant, log: GapLog, *, source: str, noise: float = 0.0, see
         seed: of the noise.
 
     Raises:
-        ValueError: the log is not of two grippers on a level table, an episode has too few samples or an uneven clock,
-            or the plant rejects a start or a command.
+        ValueError: the log is not of two grippers on a level table, has no commands, an episode has too few samples or
+            an uneven clock, or the plant rejects a start or a command.
         PlantError: the simulation became unstable.
     """
     if log.gripper_pose.shape[2:] != (2, 3):
@@ -42,6 +43,12 @@ def play(plant: TablePlant, log: GapLog, *, source: str, noise: float = 0.0, see
         raise ValueError(
             f"The motion states gravity as {gravity.tolist()} m/s^2, but the plant's table is level: state [0, 0, "
             "-9.81] in meta.gravity_m_per_s2 of both logs, and give the tilt as an effect, gravity_tilt."
+        )
+    moved = max(gripper_motion(pose[:n], 2) for pose, n in zip(log.gripper_pose, log.episode_length, strict=True))
+    if not log.gripper_command.any() and moved > 1e-3:
+        raise ValueError(
+            f"The motion has no commands, but its grippers move by {moved:.3g} m: expected one with commands, such as "
+            "a next_motion.npz of `cablejax diagnose`."
         )
     episodes, random = [], np.random.default_rng(seed)
     for e, length in enumerate(log.episode_length):

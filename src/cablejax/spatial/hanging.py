@@ -63,6 +63,7 @@ class Photographs:
     error: float
 
     def __post_init__(self):
+        object.__setattr__(self, "points", np.asarray(self.points, float))
         shape = self.points.shape
         if len(shape) != 3 or shape[0] < 3 or shape[1] < 5 or shape[2] != 2 or not np.isfinite(self.points).all():
             raise ValueError(
