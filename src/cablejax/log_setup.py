@@ -32,6 +32,8 @@ _TURN = 10.0
 """A cable that turns so many times as far as its gripper shows that the angle's unit is too small."""
 # A cable that turns so far [rad], so much with its gripper, shows its angle's unit.
 _TURNED, _WITH_IT = 0.35, 0.95
+# In a gripper that does not turn the cable's end turns so far [rad] only where it is not held: a grip yields by less.
+_DEAD = 0.7
 # A cable of so many lengths over which it bends under its own weight does not stand up in an arch.
 _HANGS = 6.0
 
@@ -146,7 +148,7 @@ def _so_far_off(gripper: int, off: float) -> str:
 def _reading_fault(log: GapLog) -> str | None:
     """Finds angles on a table that are dead, or that fit the cable far better in another unit or direction."""
     for gripper, angle, direction in _ends_seen(log):
-        if not np.ptp(angle) > 0 and (turned := _turned(log, gripper)) > _TURNED:
+        if not np.ptp(angle) > 0 and (turned := _turned(log, gripper)) > _DEAD:
             return (
                 f"The angle of gripper {gripper} is {angle[0]:.4g} rad in all samples, but the cable at it turns by "
                 f"{np.degrees(turned):.0f} degrees: was the angle recorded? Expected the cable's tangent."
