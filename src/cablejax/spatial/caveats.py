@@ -108,8 +108,9 @@ def _on_fits(windows: Windows, found: Identified) -> list[str]:
     elif groups < 6:
         result.append(f"There are only {groups} recordings: intervals over recordings are rough.")
     bends, length = (found.everything.stiffness.value / GRAVITY) ** (1 / 3), windows.arclength[-1]
-    why = ""
+    why = absent = ""
     if bends < length / EDGES:
+        absent = ", and one of these that is named may not be there"
         why = "less than an edge of the simulated cable, so its bending hardly shows"
     elif bends > length / STIFF:
         why = (
@@ -119,6 +120,7 @@ def _on_fits(windows: Windows, found: Identified) -> list[str]:
     if why:
         result.append(
             f"By its estimated stiffness the cable bends over about {1e2 * bends:.2g} cm under its own weight. That is "
-            f"{why}. Values of the stiffness, its profile and its damping may be off by more than their intervals."
+            f"{why}. Values of the stiffness, its profile and its damping may be off by more than their intervals"
+            f"{absent}."
         )
     return result
