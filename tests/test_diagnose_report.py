@@ -447,7 +447,7 @@ def test_failed_write_leaves_the_verdict_that_was_there(tmp_path):
     path = write_verdict(tmp_path / "verdict.json", diagnosis())
     before = path.read_text(encoding="utf-8")
     broken = dataclasses.replace(diagnosis(), sentence=object())
-    with pytest.raises(TypeError):
+    with pytest.raises(ValueError, match="no value that JSON has"):
         write_verdict(path, broken)
     assert path.read_text(encoding="utf-8") == before
     assert list(tmp_path.iterdir()) == [path]

@@ -489,7 +489,7 @@ def test_new_weights_and_targets_do_not_compile_anew():
         ({"min_reduction": 0.0}, "min_reduction"),
         ({"workspace": ((0.0, 1.0), (1.0, 0.0))}, "workspace"),
         # a bound at infinity took the opposite one with it
-        ({"workspace": ((0.0, -1.0), (np.inf, 1.0))}, r"workspace .* each a number from -1000 to 1000 m"),
+        ({"workspace": ((0.0, -1.0), (np.inf, 1.0))}, r"workspace .* each a number from -100 to 100 m"),
         ({"workspace": ("ab", "cd")}, "workspace"),
         ({"max_change": 0.0}, "max_change"),
         ({"max_restarts": 1.5}, "max_restarts"),

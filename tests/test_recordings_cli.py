@@ -30,7 +30,7 @@ def test_pickles_become_a_log(folder, tmp_path, capsys):
     out = tmp_path / "log.npz"
     assert main(["import", "deform", str(folder), "--out", str(out)]) == 0
     shown = capsys.readouterr().out
-    assert "2 episodes, 400 samples of 9 keypoints in space" in shown and "Nothing had to be repaired." in shown
+    assert "2 episodes, 400 samples (3.98 s at 100 Hz) of 9 keypoints in space" in shown and "Nothing had to be repaired." in shown
     assert read_gap_log(out).meta["split"] == ["train", "eval"]
     assert main(["import", "deform", str(folder), "--out", str(out)]) == 2
     assert "add --overwrite" in capsys.readouterr().err
@@ -40,7 +40,7 @@ def test_pickles_become_a_log(folder, tmp_path, capsys):
 
 def test_one_is_not_many(folder, tmp_path, capsys):
     assert main(["import", "deform", str(folder / "train" / "1.pkl"), "--out", str(tmp_path / "log.npz")]) == 0
-    assert ": 1 episode, 200 samples of 9 keypoints in space" in capsys.readouterr().out
+    assert ": 1 episode, 200 samples (1.99 s at 100 Hz) of 9 keypoints in space" in capsys.readouterr().out
 
 
 def test_repairs_are_reported(folder, tmp_path, capsys):

@@ -39,7 +39,7 @@ def json_text(value: Mapping[str, Any], **options: Any) -> str:
     def plain(one: Any) -> Any:
         if isinstance(one, (np.ndarray, np.generic)):
             return one.tolist()
-        raise ValueError(f"{shown(one)} is a {type(one).__name__}, expected what JSON has: text, numbers, lists.")
+        raise ValueError(f"{shown(one)} is no value that JSON has, expected text, numbers, lists or objects of these.")
 
     return json.dumps(value, default=plain, ensure_ascii=False, **options).encode(errors="replace").decode()
 
