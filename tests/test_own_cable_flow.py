@@ -21,6 +21,7 @@ from cablejax.types import GapLog
 REST = 15
 """Samples at rest before each recorded motion."""
 
+SMALL = ["--preset", "smoke", "--steps", "4", "--batch", "2", "--latent", "8", "--message-passing", "1"]
 CABLE = Cable(length=1.5, linear_density=0.05, bending_stiffness=0.05, n_keypoints=17)
 
 
@@ -41,8 +42,7 @@ def folder(tmp_path_factory):
     data, model = str(folder / "data.zarr"), str(folder / "model")
     few = ["--trajectories", "3", "--steps", "21", "--links", "13"]
     assert main(["simulate", "--cable", str(folder / "cable.toml"), "--out", data, *few]) == 0
-    small = ["--preset", "smoke", "--steps", "4", "--batch", "2", "--latent", "8", "--message-passing", "1"]
-    assert main(["train", "--data", data, "--out", model, "--held-out", "0.3", *small]) == 0
+    assert main(["train", "--data", data, "--out", model, "--held-out", "0.3", *SMALL]) == 0
     return folder
 
 
@@ -57,6 +57,16 @@ def test_data_and_weights_hold_the_cable_and_the_card_says_how_to_make_them_agai
     card = (folder / "model" / "card.md").read_text()
     assert "cablejax cable --from model --out cable.toml\ncablejax simulate --out data.zarr" in card
     assert "--cable cable.toml" in card
+
+
+def test_another_training_in_its_folder_is_told_apart_in_words(folder, capsys):
+    train = ["train", "--data", str(folder / "data.zarr"), "--out", str(folder / "model"), "--held-out", "0.7", *SMALL]
+    assert main(train) == 2
+    assert "differs in its data, or what is held out of them (--data, --held-out" in capsys.readouterr().err
+    assert main([*train, "--conditioned"]) == 2
+    said = capsys.readouterr().err
+    assert "All cables of the data are equally stiff and rough" in said
+    assert "differs in config.model.conditioned (False, now True), its data" in said
 
 
 def test_the_page_says_what_the_plant_has_and_the_log_what_the_model_believes(folder, capsys):

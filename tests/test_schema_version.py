@@ -144,6 +144,7 @@ def test_places_of_a_verdict_are_about_where_its_grippers_were(tmp_path):
         return [dict(drawn.parameters)[name] for name in ("x_m", "y_m", "radius_m")]
 
     assert read([4.5, -0.1]) == pytest.approx([0.3, 0.3, 0.03])
+    assert read([504.5, -2000.1])[:2] == pytest.approx([-499.7, 2000.3]), "far from the origin of its frame"
     assert read(None) == [4.8, 0.2, 0.03], "of an older version"
     with pytest.raises(ValueError, match=r"place_m is \[0.0\], expected x and y in metres"):
         read([0.0])

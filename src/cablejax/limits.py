@@ -95,6 +95,8 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         # bounds of a motion
         # those in millimetres are beyond
         "place": Limit(-100.0, 100.0, "m"),
+        # of a recording, in whatever frame
+        "origin": Limit(-1e4, 1e4, "m"),
         "gripper_speed": Limit(1e-4, 10.0, "m/s"),
         "turn_rate": Limit(1e-3, 100.0, "rad/s"),
         "bend_radius": Limit(1e-4, 10.0, "m"),

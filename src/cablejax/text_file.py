@@ -41,7 +41,10 @@ def json_text(value: Mapping[str, Any], **options: Any) -> str:
             return one.tolist()
         raise ValueError(f"{shown(one)} is no value that JSON has, expected text, numbers, lists or objects of these.")
 
-    return json.dumps(value, default=plain, ensure_ascii=False, **options).encode(errors="replace").decode()
+    try:
+        return json.dumps(value, default=plain, ensure_ascii=False, **options).encode(errors="replace").decode()
+    except TypeError as error:  # a key that is no text
+        raise ValueError(f"it is no JSON: {error}.") from error
 
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -84,11 +84,6 @@ class Train(Command):
             require(self.lr, "learning_rate", "--lr")
         stores = [open_store(path) for path in self.data]
         self._check_cables(stores)
-        if self.conditioned and all(low == high for low, high in inputs_of_data(stores, self.held_out).limits):
-            say(
-                "All cables of the data are equally stiff and rough, so a conditioned network learns nothing of its "
-                "inputs: simulate with --stiffness-range or --friction-range, or leave --conditioned out."
-            )
         asymmetric = sorted({name for store in stores for name in store.config.asymmetric})
         config = self._config(stores[0], flips=not asymmetric)
         if asymmetric and self.symmetric:
@@ -98,6 +93,11 @@ class Train(Command):
             )
         training_mesh(config)  # refuses a batch that the devices cannot share, before anything is read
         training, held_out = read_split(stores, self.held_out, buffer=self.buffer, seed=self.seed)
+        if self.conditioned and all(low == high for low, high in inputs_of_data(stores, self.held_out).limits):
+            say(
+                "All cables of the data are equally stiff and rough, so a conditioned network learns nothing of its "
+                "inputs: simulate with --stiffness-range or --friction-range, or leave --conditioned out."
+            )
         count = sum(len(part.gripper_twist) for part in held_out)
         total = sum(store.config.n_trajectories for store in stores) - count
         say(f"{total} trajectories to train on, {count} held out; {config.total_steps} steps")

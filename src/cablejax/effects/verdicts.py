@@ -61,8 +61,8 @@ def posterior_of_verdict(path: str | os.PathLike[str]) -> tuple[tuple[GivenEffec
     place = verdict.get("place_m")
     if place is None:
         return drawn or (named,)
-    if not (isinstance(place, list) and len(place) == 2 and all(value in LIMITS["place"] for value in place)):
-        raise ValueError(f"{path}: place_m is {shown(place)}, expected x and y in metres, {LIMITS['place']}.")
+    if not (isinstance(place, list) and len(place) == 2 and all(value in LIMITS["origin"] for value in place)):
+        raise ValueError(f"{path}: place_m is {shown(place)}, expected x and y in metres, {LIMITS['origin']}.")
     return tuple(tuple(_about(effect, place) for effect in one) for one in drawn or (named,))
 
 
