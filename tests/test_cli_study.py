@@ -157,12 +157,18 @@ def test_damaged_rounds_are_made_again_and_those_of_an_earlier_study_deleted(tmp
     state.write_text('{"rounds": 3}')
     (tmp_path / "recording_2.npz").write_bytes(b"cut off")
     assert finished_rounds(state) == 1 and "Round 2 was kept, but is damaged" in capsys.readouterr().err
-    # of the user, who has no fifth round
+    # a fourth round that a kill left without a verdict, and files of the user, who has no fifth
+    (tmp_path / "round_4").mkdir()
+    write_gap_log(tmp_path / "recording_4.npz", first_recording(LONG, straight_start(LONG), GOALS))
     (tmp_path / "recording_5.npz").write_text("mine")
     (tmp_path / "round_7").mkdir()
     remove_rounds(tmp_path, 1)
     kept = {path.name for path in tmp_path.iterdir()}
     assert kept == {"parts", "recording_1.npz", "round_1", "recording_5.npz", "round_7"}
+    (tmp_path / "round_2").mkdir()
+    (tmp_path / "round_2" / "photo.jpg").write_text("mine")
+    remove_rounds(tmp_path, 1)
+    assert (tmp_path / "round_2" / "photo.jpg").exists()
 
 
 def test_a_study_that_goes_on_with_fewer_rounds_keeps_none_beyond_them(tmp_path, monkeypatch):

@@ -124,7 +124,7 @@ def test_angles_that_were_converted_from_degrees_and_were_none_are_told():
     ids=["negated", "quarter turn", "quarter turn back", "converted twice", "dead"],
 )
 def test_angles_that_another_reading_explains_are_not_diagnosed(change, words):
-    points, pose = (whole[:12] for whole in motion(samples=20))
+    points, pose = (whole[: 20 if "rad in all" in words else 12] for whole in motion(samples=20))
     log = log_of(points, np.concatenate([pose[..., :2], change(pose[..., 2:])], axis=-1))
     with pytest.raises(DiagnosisError, match=words):
         prepare_log(longer(log))
@@ -135,6 +135,20 @@ def test_angles_that_another_reading_explains_are_not_diagnosed(change, words):
 def test_a_clamp_as_askew_as_its_effect_may_be_is_diagnosed(heading, offset):
     points, pose = motion(heading)
     prepare_log(longer(log_of(points, pose + np.array([0.0, 0.0, offset]))))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_one_gripper_may_stand_still_and_one_may_hardly_turn(noise):
+    """Dense keypoints show the tangent with much noise; a gripper that turns by two degrees is not in other units."""
+    cable = Cable(length=0.5, n_keypoints=51)
+    swing = np.sin(np.linspace(0.0, np.pi, 30))
+    for turn in (0.0, np.radians(2.0)):
+        pose = np.zeros((30, 2, 3))
+        pose[:, 0, 2], pose[:, 1, 0], pose[:, 1, 1], pose[:, 1, 2] = turn * swing, 0.4, 0.1 * swing, 0.8 * swing
+        points = np.stack([elastica(one, cable.length, cable.keypoint_arclength) for one in pose])
+        points = points + noise * np.random.default_rng(0).standard_normal(points.shape)
+        still = Episode("swing", 0.1 * np.arange(30), points, pose, np.zeros((30, 2, 3)), np.zeros(30, bool))
+        assert cable_fault(gap_log_from_episodes([still], cable, source="test")) is None
 
 
 def test_a_gripper_that_does_not_turn_holds_the_end_of_a_cable_that_bends():

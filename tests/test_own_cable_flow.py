@@ -62,7 +62,10 @@ def test_data_and_weights_hold_the_cable_and_the_card_says_how_to_make_them_agai
 def test_another_training_in_its_folder_is_told_apart_in_words(folder, capsys):
     train = ["train", "--data", str(folder / "data.zarr"), "--out", str(folder / "model"), "--held-out", "0.7", *SMALL]
     assert main(train) == 2
-    assert "differs in its data, or what is held out of them (--data, --held-out" in capsys.readouterr().err
+    assert (
+        "differs in its data, what is held out of them, or the weights to start from (--data, --held-out"
+        in capsys.readouterr().err
+    )
     assert main([*train, "--conditioned"]) == 2
     said = capsys.readouterr().err
     assert "All cables of the data are equally stiff and rough" in said

@@ -147,13 +147,16 @@ def _so_far_off(gripper: int, off: float) -> str:
 
 def _reading_fault(log: GapLog) -> str | None:
     """Finds angles on a table that are dead, or that fit the cable far better in another unit or direction."""
+    # one of two arms may well not turn
+    dead = not np.ptp(log.gripper_pose[log.valid][..., 2], axis=0).any()
     for gripper, angle, direction in _ends_seen(log):
-        if not np.ptp(angle) > 0 and (turned := _turned(log, gripper)) > _DEAD:
+        if dead and (turned := _turned(log, gripper)) > _DEAD:
             return (
                 f"The angle of gripper {gripper} is {angle[0]:.4g} rad in all samples, but the cable at it turns by "
                 f"{np.degrees(turned):.0f} degrees: was the angle recorded? Expected the cable's tangent."
             )
-        if (times := _turns_less(angle, direction)) > _TURN:
+        as_degrees = _scatter(np.degrees(angle) - direction) <= _scatter(angle - direction)
+        if as_degrees and (times := _turns_less(angle, direction)) > _TURN:
             return (
                 f"The cable next to gripper {gripper} turns {times:.0f} times as far as the gripper's angle, and with "
                 "it: the angle is in units of 180 / pi rad, since it was converted from degrees although it was in "
@@ -180,7 +183,10 @@ def _reading_fault(log: GapLog) -> str | None:
 
 
 def _turned(log: GapLog, gripper: int) -> float:
-    """By how much the tangent at a gripper turns [rad], continued from the two chords next to it; nine tenths of it."""
+    """By how much the tangent at a gripper surely turns [rad], continued from the two chords next to it.
+
+    Less what the chords turn against each other, by noise or where the cable bends within them.
+    """
     ends = log.keypoints[log.valid].astype(float)
     ends = ends[:, :3] if gripper == 0 else ends[:, :-4:-1]
     if ends.shape[1] < 3:
@@ -190,9 +196,12 @@ def _turned(log: GapLog, gripper: int) -> float:
     along = np.diff(ends, axis=1)
     first, second = np.moveaxis(np.arctan2(along[..., 1], along[..., 0]), -1, 0)
     bend = np.arctan2(np.sin(second - first), np.cos(second - first))
-    tangent = first - bend * near / (near + next_)
-    tangent = np.unwrap(tangent[np.isfinite(tangent)])
-    return float(np.subtract(*np.percentile(tangent, [95, 5]))) if len(tangent) else 0.0
+    seen = np.isfinite(bend)
+    if not seen.any():
+        return 0.0
+    tangent = np.unwrap((first - bend * near / (near + next_))[seen])
+    turned, against = (float(np.subtract(*np.percentile(part, [95, 5]))) for part in (tangent, bend[seen]))
+    return turned - against
 
 
 def _turns_less(angle: Float[np.ndarray, " S"], direction: Float[np.ndarray, " S"]) -> float:

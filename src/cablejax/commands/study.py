@@ -155,8 +155,20 @@ def remove_rounds(out: pathlib.Path, kept: int) -> None:
         (out / old).unlink(missing_ok=True)
     for number in itertools.count(kept + 1):
         folder = out / f"round_{number}"
-        # the first one may have been left by a kill; others of such names, without a verdict, are the user's
-        if number > kept + 1 and not (folder / "verdict.json").is_file():
+        recording, judged = out / f"recording_{number}.npz", (folder / "verdict.json").is_file()
+        # a kill may leave a round without a verdict; what else has such a name is the user's
+        if judged or _is_gap_log(recording):
+            recording.unlink(missing_ok=True)
+            shutil.rmtree(folder, ignore_errors=True)
+        elif number > kept + 1:
             return
-        (out / f"recording_{number}.npz").unlink(missing_ok=True)
-        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_gap_log(path: pathlib.Path) -> bool:
+    from cablejax.gaplog import read_gap_log
+
+    try:
+        read_gap_log(path)
+    except (FileNotFoundError, ValueError):
+        return False
+    return True

@@ -90,7 +90,7 @@ def _changes(found: Mapping[str, Any], run: Mapping[str, Any]) -> str:
     other = differences(found, run)
     words = []
     if other.pop("data", None):
-        words = ["its data, or what is held out of them (--data, --held-out, --buffer)"]
+        words = ["its data, what is held out of them, or the weights to start from (--data, --held-out, --start-from)"]
         # the scales are those of the data
         other = {name: values for name, values in other.items() if not name.startswith(_SCALES)}
     return ", ".join([*(f"{name} ({old}, now {new})" for name, (old, new) in other.items()), *words])
