@@ -90,13 +90,12 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         "coordinate": Limit(0.0, 1e4, "m or rad"),
         "speed": Limit(0.0, 1e3, "m/s or rad/s"),
         "duration": Limit(0.0, 1e4, "s"),
+        # of a set-up in its recording's frame, whatever that is
+        "origin": Limit(-1e4, 1e4, "m"),
         # since 1970 or since a start
         "stamp": Limit(0.0, 1e10, "s"),
-        # bounds of a motion
-        # those in millimetres are beyond
+        # bounds of a motion: places in millimetres are beyond
         "place": Limit(-100.0, 100.0, "m"),
-        # of a recording, in whatever frame
-        "origin": Limit(-1e4, 1e4, "m"),
         "gripper_speed": Limit(1e-4, 10.0, "m/s"),
         "turn_rate": Limit(1e-3, 100.0, "rad/s"),
         "bend_radius": Limit(1e-4, 10.0, "m"),

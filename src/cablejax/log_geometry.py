@@ -17,9 +17,10 @@ MOVED = 0.02
 AT_GRIPPER = 0.1
 """Largest median distance of an end's keypoint from its gripper, in lengths of the cable."""
 _FEWEST = 5
-_DEGREES_OFF = 0.5
-_DEGREES_BETTER = 3.0
-_DEGREES_TURN = 10.0
+OFF, BETTER = 0.5, 3.0
+"""An angle so far off the cable [rad], and so many times nearer to it in another reading, was misread."""
+TURN = 10.0
+"""A gripper and the cable next to it, one of which turns so many times as far as the other, are in different units."""
 RADIANS = 'expected radians. Multiply it by pi / 180 (in a layout: `angle_unit = "deg"`).'
 """What to do with an angle in degrees."""
 
@@ -118,14 +119,14 @@ def _angle_fault(angle: Float[np.ndarray, " S"], direction: Float[np.ndarray, " 
     if not len(angle):
         return None
     off, in_degrees = median_angle(angle - direction), median_angle(np.radians(angle) - direction)
-    turns_too_far = np.ptp(angle) > max(np.pi, _DEGREES_TURN * np.ptp(np.unwrap(direction)))
-    if turns_too_far and off > max(_DEGREES_OFF, _DEGREES_BETTER * in_degrees):
+    turns_too_far = np.ptp(angle) > max(np.pi, TURN * np.ptp(np.unwrap(direction)))
+    if turns_too_far and off > max(OFF, BETTER * in_degrees):
         return (
             f"up to {np.abs(angle).max():.3g}, which fits the cable next to it in degrees (median difference "
             f"{in_degrees:.2g} rad) and not in radians ({off:.2g} rad): {RADIANS}"
         )
     mirrored = median_angle(angle + direction)
-    if off > INWARDS and mirrored < _DEGREES_OFF:
+    if off > INWARDS and mirrored < OFF:
         return (
             f"{np.degrees(off):.0f} degrees off the cable next to it (median), and {np.degrees(mirrored):.0f} with the "
             "other sign: either y or the angle is mirrored. Negate the angle if it counts clockwise."

@@ -9,7 +9,17 @@ from jaxtyping import Float
 
 from cablejax.cable import GRAVITY
 from cablejax.cable_length import BENT, ring_chords
-from cablejax.log_geometry import AT_GRIPPER, INWARDS, RADIANS, ends_exchanged, median_angle, tangents
+from cablejax.log_geometry import (
+    AT_GRIPPER,
+    BETTER,
+    INWARDS,
+    OFF,
+    RADIANS,
+    TURN,
+    ends_exchanged,
+    median_angle,
+    tangents,
+)
 from cablejax.poses import rotated
 from cablejax.types import GapLog
 
@@ -26,10 +36,6 @@ QUATERNIONS = {
 """Other conventions of a quaternion, and how one is read from it."""
 _NEAR = 1 / 8
 """Distance between an end's two keypoints, in lengths of the cable, up to which they show its direction there."""
-_OFF, _BETTER = 0.5, 3.0
-"""An angle so far off the cable [rad], and so many times nearer to it in another reading, was misread."""
-_TURN = 10.0
-"""A cable that turns so many times as far as its gripper shows that the angle's unit is too small."""
 # A cable that turns so far [rad], so much with its gripper, shows its angle's unit.
 _TURNED, _WITH_IT = 0.35, 0.95
 # In a gripper that does not turn the cable's end turns so far [rad] only where it is not held: a grip yields by less.
@@ -155,8 +161,10 @@ def _reading_fault(log: GapLog) -> str | None:
                 f"The angle of gripper {gripper} is {angle[0]:.4g} rad in all samples, but the cable at it turns by "
                 f"{np.degrees(turned):.0f} degrees: was the angle recorded? Expected the cable's tangent."
             )
-        as_degrees = _scatter(np.degrees(angle) - direction) <= _scatter(angle - direction)
-        if as_degrees and (times := _turns_less(angle, direction)) > _TURN:
+        own, in_degrees = angle - direction, np.degrees(angle) - direction
+        # a clamp that is askew, by as much as its effect says, follows the cable's direction better as it is
+        follows = _scatter(own) + 1e-6
+        if _scatter(in_degrees) <= follows and (times := _turns_less(angle, direction)) > TURN:
             return (
                 f"The cable next to gripper {gripper} turns {times:.0f} times as far as the gripper's angle, and with "
                 "it: the angle is in units of 180 / pi rad, since it was converted from degrees although it was in "
@@ -164,21 +172,16 @@ def _reading_fault(log: GapLog) -> str | None:
             )
         others = {
             f"in degrees: {RADIANS}": np.radians(angle) - direction,
-            "in units of 180 / pi rad: it was converted from degrees although it was in radians.": np.degrees(angle)
-            - direction,
+            "in units of 180 / pi rad: it was converted from degrees although it was in radians.": in_degrees,
             "with the other sign: either y or the angle is mirrored. Negate the angle.": -angle - direction,
-            "a quarter turn further: expected the cable's tangent.": angle + np.pi / 2 - direction,
-            "a quarter turn back: expected the cable's tangent.": angle - np.pi / 2 - direction,
+            "a quarter turn further: expected the cable's tangent.": own + np.pi / 2,
+            "a quarter turn back: expected the cable's tangent.": own - np.pi / 2,
         }
-        off = median_angle(angle - direction)
-        # a clamp that is askew, by as much as its effect says, follows the cable's direction better as it is
-        follows = _scatter(angle - direction) + 1e-6
-        better = {advice: median_angle(change) for advice, change in others.items() if _scatter(change) <= follows}
-        if not better:
-            continue
-        advice = min(better, key=better.__getitem__)
-        if off > _OFF and better[advice] < off / _BETTER:
-            return f"{_so_far_off(gripper, off)}, and {np.degrees(better[advice]):.0f} {advice}"
+        fitting = ((median_angle(one), words) for words, one in others.items() if _scatter(one) <= follows)
+        better, advice = min(fitting, default=(np.inf, ""))
+        off = median_angle(own)
+        if off > OFF and better < off / BETTER:
+            return f"{_so_far_off(gripper, off)}, and {np.degrees(better):.0f} {advice}"
     return None
 
 
@@ -230,7 +233,7 @@ def misread_quaternions(points: Float[np.ndarray, "S N 3"], quaternion: Float[np
     for name, change in QUATERNIONS.items():
         better = _off_axis(points, change(quaternion))
         # an axis that points the other way along the cable is as far from it as the reversed one is near
-        if (stated > ASKEW).all() and (better < np.minimum(stated / _BETTER, np.pi - stated)).all():
+        if (stated > ASKEW).all() and (better < np.minimum(stated / BETTER, np.pi - stated)).all():
             one, other = np.degrees(stated)
             return (
                 f"The x axes of grippers 0 and 1 are {one:.0f} and {other:.0f} degrees off the cable next to them "

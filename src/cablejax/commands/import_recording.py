@@ -154,13 +154,12 @@ def _described(path: pathlib.Path, log: GapLog, repairs: Sequence[str]) -> tuple
         "observed": seen,
         "repairs": list(repairs),
     }
-    steps = [float(np.median(np.diff(one[:n]))) for one, n in zip(log.time, log.episode_length, strict=True) if n > 1]
-    rates = dict.fromkeys(f"{1 / step:.4g}" for step in sorted(steps, reverse=True))
-    rate = f" at {' to '.join(list(rates)[:: max(len(rates) - 1, 1)])} Hz" if rates else ""
+    rates = [1 / np.median(np.diff(one[:n])) for one, n in zip(log.time, log.episode_length, strict=True) if n > 1]
+    ends = dict.fromkeys(f"{end(rates):.4g}" for end in (min, max) if rates)
+    rate = f" at {' to '.join(ends)} Hz" if rates else ""
     line = (
         f"{path}: {counted(len(log.keypoints), 'episode')}, {counted(len(points), 'sample')} "
-        f"({log.intervals.sum():.4g} s{rate}) "
-        f"of {points.shape[1]} "
+        f"({log.intervals.sum():.4g} s{rate}) of {points.shape[1]} "
         f"keypoints in {'space' if log.in_space else 'the plane'}, {100 * seen:.4g} % of them observed; the cable is "
         f"{length:.4g} m long."
     )

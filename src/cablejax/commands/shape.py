@@ -157,8 +157,8 @@ class Shape(Command):
         plant = plant_of(cable, effects, links=self.links, seed=self.seed)
         if len(commands.intervals):
             # a motion at 30 Hz, of which no time step of the plant is a part
-            usual = plant.discretisation.dividing(round(float(commands.intervals[0]), 9))
-            plant = dataclasses.replace(plant, discretisation=usual)
+            fitting = plant.discretisation.dividing(round(float(commands.intervals[0]), 9))
+            plant = dataclasses.replace(plant, discretisation=fitting)
         noise = 1e-3 * (self.noise_mm or 0.0)
         settings = {"motion": commands.meta, "plant": dataclasses.asdict(plant), "noise": noise}
         with unfinished(self.out, settings, overwrite=self.overwrite):

@@ -171,8 +171,10 @@ def _clear(place: pathlib.Path | Bucket, config: DatasetConfig) -> None:
     from cablejax.dataset.generate import WRITER
     from cablejax.dataset.opening import open_store
 
-    bucket = isinstance(place, Bucket)
-    names = place.names() if bucket else [file.name for file in place.iterdir()] if place.is_dir() else []
+    if isinstance(place, Bucket):
+        names = place.names()
+    else:
+        names = [file.name for file in place.iterdir()] if place.is_dir() else []
     if not names or (old := open_store(str(place))).config == config:
         return
     others = {name.partition("/")[0] for name in names} - old.names
