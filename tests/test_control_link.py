@@ -202,6 +202,15 @@ def test_a_tracker_that_stopped_is_blind():
     assert reply.status == Status.PAUSED and np.abs(robot.pose - START).max() < 0.1
 
 
+def test_a_tracker_that_stopped_is_blind_while_the_grippers_turn():
+    robot = Harness(Inwards(speed=0.0, turn=0.1))
+    frozen = KEYPOINTS.copy()
+    for k in range(60):
+        reply = robot.step(0.1 * k, robot.seen(0.1 * k, keypoints=frozen))
+        robot.pose = robot.pose + 0.1 * reply.twist
+    assert reply.status == Status.PAUSED and np.abs(robot.pose - START).max() < 0.25
+
+
 def test_a_tracker_that_stopped_where_a_pose_was_not_known_is_blind():
     robot = Harness(Inwards(speed=0.05))
     robot.run(1.0)
@@ -237,6 +246,33 @@ def test_what_comes_late_is_commanded_late_in_the_log_too():
     # each ends 1.2 s after what it was made for, and the next one comes 1.3 s after that
     moving, index = episode.gripper_command[:, 0, 0] != 0, np.arange(len(episode.time))
     np.testing.assert_array_equal(moving, (index >= 13) & (index % 10 != 2))
+
+
+def test_a_command_holds_since_it_was_computed():
+    """Or a log has it in force before the arms could know of it, and perfect arms seem to lag."""
+    clock = [0.0]
+
+    class Slow(Inwards):
+        def step(self, state, measurement):
+            clock[0] += 0.15
+            return super().step(state, measurement)
+
+    robot = Harness(Slow())
+    for k in range(25):
+        clock[0] = max(clock[0], 0.1 * k)
+        robot.state, reply = robot.link.step(robot.state, clock[0], [robot.seen(0.1 * k)], lambda: clock[0])
+        robot.log.add(reply)
+    since = [since for since, _, twist in robot.log._commands if twist.any()]
+    assert since == pytest.approx([1.15, 2.15], abs=5e-3)
+    [(_, episode)] = robot.log.episodes("test")
+    np.testing.assert_array_equal(episode.gripper_command.any(axis=(1, 2)), episode.time > 1.15)
+
+
+def test_a_command_that_took_longer_than_it_holds_is_not_executed():
+    robot = Harness()
+    robot.run(0.9)
+    robot.state, reply = robot.link.step(robot.state, 1.0, [robot.seen(1.0)], lambda: 3.0)
+    assert reply.instant.twist.any() and not reply.twist.any()
 
 
 def test_a_pause_is_one_event_however_old_its_observations():
@@ -296,6 +332,62 @@ def test_a_run_is_done_after_its_commands_or_at_rest():
     robot = Harness(Inwards(speed=0.0), patience=2)
     reply = robot.run(8.0)
     assert reply.status == Status.DONE and "settled" in reply.reason and len(robot.log.instants) == 3
+
+
+@pytest.mark.parametrize(("speed", "ended"), [(0.0, True), (0.005, False)])
+def test_noise_does_not_keep_a_run_from_settling(speed, ended):
+    rng, robot = np.random.default_rng(0), Harness(Inwards(speed=speed), patience=6)
+    moved = np.zeros(2)
+    for k in range(200):
+        keypoints = KEYPOINTS + moved + 2e-3 * rng.standard_normal(KEYPOINTS.shape)
+        reply = robot.step(0.1 * k, robot.seen(0.1 * k, keypoints=keypoints))
+        moved = moved + 0.1 * reply.twist[0, [1, 0]]
+        if reply.status.ended:
+            break
+    assert (reply.status == Status.DONE) == ended and k >= 69
+
+
+@dataclasses.dataclass(frozen=True)
+class Watching(Inwards):
+    """Keeps what it was given."""
+
+    given: list = dataclasses.field(default_factory=list)
+
+    def init(self, history):
+        self.given.append(history)
+        return super().init(history)
+
+    def step(self, state, measurement):
+        self.given.append(measurement)
+        return super().step(state, measurement)
+
+
+def test_an_end_that_a_gripper_hides_is_where_the_gripper_is():
+    watching = Watching()
+    robot = Harness(watching)
+    for k in range(21):
+        seen = robot.seen(0.1 * k)
+        seen.keypoints[:2] = seen.keypoints[-1] = np.nan
+        robot.step(0.1 * k, seen)
+    history, first, second = watching.given
+    np.testing.assert_allclose(history.keypoints[-1][[0, -1]], START[:, :2])
+    np.testing.assert_allclose(history.keypoints[-1][1], (START[0, :2] + history.keypoints[-1][2]) / 2)
+    for measurement in (first, second):
+        np.testing.assert_allclose(measurement.keypoints[[0, -1]], START[:, :2])
+        assert np.isnan(measurement.keypoints[1]).all()
+    [(_, episode)] = robot.log.episodes("test")
+    assert np.isnan(episode.keypoints[:, 0]).all(), "the log has what was observed"
+
+
+def test_a_controller_is_told_what_the_limits_left_of_its_command():
+    watching = Watching(speed=0.2)
+    Harness(watching).run(2.0)
+    _, first, second = watching.given
+    assert not first.twist.any()
+    np.testing.assert_allclose(second.twist[:, 0], [0.1, -0.1])
+    watching = Watching(speed=0.2)
+    Harness(watching, limits=None).run(2.0)
+    assert watching.given[-1].twist is None
 
 
 LIMITS = CommandLimits(speed=0.1, turn_rate=0.5, max_distance=1.0, workspace=((-0.6, -0.2), (0.6, 0.2)))
@@ -462,7 +554,35 @@ def test_a_clock_that_was_set_back_is_reported():
     reply = harness.step(504.0)
     assert reply.status == Status.PAUSED
     reply = harness.step(504.1, harness.seen(4.1))
-    assert reply.status == Status.PAUSED and "was the clock set back?" in reply.reason
+    assert reply.status == Status.PAUSED and "was the clock set back? Then start the run again." in reply.reason
+
+
+@dataclasses.dataclass(frozen=True)
+class Turning(Inwards):
+    """Outwards and to one side, faster and faster."""
+
+    def step(self, state, measurement):
+        speed = self.speed * (1 + state)
+        return state + 1, np.array([[-speed, speed, 0.0], [speed, speed, 0.0]]), None
+
+
+@pytest.mark.parametrize("late", [0.0, 0.05, 0.1, 0.19, 0.4])
+def test_limits_hold_however_late_commands_begin(late):
+    """A gripper goes on with the last command until the next one has come, or `until`."""
+    limits = CommandLimits(workspace=((-2.0, -0.5), (2.0, 0.1)))
+    robot, queue, twist, until = Harness(Turning(speed=0.002), limits=limits), [], np.zeros((2, 3)), np.inf
+    robot.pose = robot.pose * [0.96, 1.0, 1.0]
+    for k in range(2000):
+        now = 0.01 * k
+        if k % 10 == 0:
+            reply = robot.step(now, robot.seen(now))
+            queue.append((now + late, reply.twist, reply.until))
+        while queue and queue[0][0] <= now + 1e-9:
+            _, twist, until = queue.pop(0)
+        robot.pose = robot.pose + 0.01 * (twist if now < until - 1e-9 else 0.0)
+        assert np.linalg.norm(robot.pose[1, :2] - robot.pose[0, :2]) <= limits.max_distance + 1e-9
+        assert (robot.pose[:, 1] <= 0.1 + 1e-9).all()
+    assert robot.log.counts["limited"] > 0
 
 
 def test_limits_that_leave_no_motion_are_reported():

@@ -461,6 +461,33 @@ def test_many_cables_in_one_call_are_the_same_as_one_by_one():
         assert float(info.objective[i]) == pytest.approx(float(alone.objective), rel=1e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("adaptation", [None, AdaptationConfig()])
+def test_the_model_is_judged_by_the_twist_that_was_executed(adaptation):
+    """A command that something else shortened is not an error of the model."""
+    config = dataclasses.replace(CONFIG, adaptation=adaptation)
+    control, cable = controller(config=config), Cable()
+    state = control.init(at_rest(START))
+    state, twist, _ = control.step(state, Measurement(cable.keypoints, cable.pose))
+    executed = 0.4 * np.asarray(twist)
+    cable.step(executed)
+    newest, pose = state.history.keypoints[-1], state.history.gripper_pose
+    told, *_ = control.step(state, Measurement(cable.keypoints, cable.pose, executed))
+    displacement = relaxing_cable(control.weights, state.history, jnp.asarray(executed))
+    expected = cable.keypoints - newest - displacement
+    np.testing.assert_allclose(told.learner.window.error[-1], expected, atol=1e-12)
+    np.testing.assert_allclose(told.learner.window.twist[-1], executed, atol=1e-12)
+    # a pose that was not measured is where the executed command led
+    blind, *_ = control.step(state, Measurement(cable.keypoints, np.full((2, 3), np.nan), executed))
+    np.testing.assert_allclose(blind.history.gripper_pose, pose + executed, atol=1e-12)
+    # told the command itself, it does what it does untold
+    for one, other in zip(
+        *(jax.tree.leaves(control.step(state, Measurement(cable.keypoints, cable.pose, t))) for t in (None, twist)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, other, atol=1e-7)
+
+
 def test_new_weights_and_targets_do_not_compile_anew():
     traces = []
 
@@ -536,6 +563,8 @@ def test_impossible_inputs_are_refused():
         control.step(state, Measurement([[0.0, 0.0]] * N, np.zeros((2, 3))))
     with pytest.raises(ValueError, match="gripper poses"):
         control.step(state, Measurement(np.zeros((N, 2)), np.zeros((3, 3))))
+    with pytest.raises(ValueError, match=r"twist of shape \(3,\), expected \(2, 3\)"):
+        control.step(state, Measurement(np.zeros((N, 2)), np.zeros((2, 3)), np.zeros(3)))
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from cablejax.control.link_state import LinkConfig
 from cablejax.control.targets import straight_start
 from cablejax.gaplog import GapLogError, read_gap_log
 from cablejax.robot import server
-from cablejax.robot.ros_node import make_node
+from cablejax.robot.ros_node import spin
 from cablejax.robot.session import RobotRun
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.table_plant import Observation
@@ -387,14 +387,18 @@ def sent(message, name):
 class Node:
     """Stands in for `rclpy.node.Node`: topics are lists of what is received, and time is set by hand."""
 
+    usable = False
+    """Between `rclpy.init` and `rclpy.shutdown`."""
+
     def __init__(self, name):
+        assert Node.usable
         self.name, self.topics, self.callbacks, self.timers, self.now, self.warnings = name, {}, {}, [], 0.0, []
 
     def create_publisher(self, kind, topic, depth):
         received = self.topics.setdefault(topic, [])
 
         def publish(message):
-            assert type(message) is kind
+            assert type(message) is kind and Node.usable
             received.append(sent(message, kind.__name__))
 
         return types.SimpleNamespace(publish=publish)
@@ -412,11 +416,26 @@ class Node:
     def get_logger(self):
         return types.SimpleNamespace(warning=self.warnings.append)
 
+    def destroy_node(self):
+        self.timers.clear()
+
+    def sent(self):
+        """The twists received last."""
+        twists = [self.topics[f"~/gripper_{q}/twist"][-1].twist for q in (0, 1)]
+        return np.array([[t.linear.x, t.linear.y, t.angular.z] for t in twists])
+
 
 @pytest.fixture
 def ros(monkeypatch):
+    """The stub of rclpy, whose `spin` a test replaces by what happens to the node."""
+
+    def init(signal_handler_options):
+        assert signal_handler_options == "none", "its handler of Ctrl-C shuts publishers down at once"
+        Node.usable = True
+
     for name, contents in {
-        "rclpy": {},
+        "rclpy": {"init": init, "shutdown": lambda: setattr(Node, "usable", False)},
+        "rclpy.signals": {"SignalHandlerOptions": types.SimpleNamespace(NO="none")},
         "rclpy.node": {"Node": Node},
         "geometry_msgs": {},
         "geometry_msgs.msg": {
@@ -428,6 +447,7 @@ def ros(monkeypatch):
         module = types.ModuleType(name)
         vars(module).update(contents)
         monkeypatch.setitem(sys.modules, name, module)
+    return sys.modules["rclpy"]
 
 
 def time_of(seconds):
@@ -466,10 +486,12 @@ def test_the_messages_are_as_strict_as_rosidls(ros):
 
 def test_a_ros_node_drives_the_same_run(tmp_path, ros):
     run, harness = run_to(tmp_path / "log.npz", steps=2), Harness()
-    node = make_node(run)
-    [(period, timer)] = node.timers
-    assert period == 0.05
-    with pytest.raises(SystemExit):
+    nodes = []
+
+    def two_commands(node):
+        nodes.append(node)
+        [(period, timer)] = node.timers
+        assert period == 0.05
         for k in range(200):
             node.now = 1.7e9 + 0.05 * k
             if k % 2 == 0:
@@ -477,41 +499,78 @@ def test_a_ros_node_drives_the_same_run(tmp_path, ros):
                 node.callbacks["~/grippers"](pose_array(node.now, seen.gripper_pose[:, :2], seen.gripper_pose[:, 2]))
                 node.callbacks["~/keypoints"](pose_array(node.now, seen.keypoints))
             timer()
-            twists = [node.topics[f"~/gripper_{q}/twist"][-1].twist for q in (0, 1)]
-            twist = np.array([[t.linear.x, t.linear.y, t.angular.z] for t in twists])
-            harness.pose = harness.pose + 0.05 * twist
+            harness.pose = harness.pose + 0.05 * node.sent()
+
+    ros.spin = two_commands
+    log = read_gap_log(spin(run))
+    [node] = nodes
     last = node.topics["~/gripper_0/twist"][-1].header
     assert last.frame_id == "world" and last.stamp.sec + 1e-9 * last.stamp.nanosec == pytest.approx(node.now)
     statuses = list(dict.fromkeys(message.data for message in node.topics["~/status"]))
     assert statuses == ["resting", "shaping", "done: All 2 commands were sent."] and not node.warnings
     np.testing.assert_allclose(harness.pose[:, 0] - START[:, 0], [0.02, -0.02], atol=2e-3)
-    log = read_gap_log(run.finish())
     assert log.episode_length.tolist() == [31] and run.result().stopped is None
     np.testing.assert_allclose(log.gripper_pose[0, 0], straight_start(CABLE), atol=1e-6)
+    assert not Node.usable and not node.timers and not node.sent().any()
+
+
+class Failing(Inwards):
+    def step(self, state, measurement):
+        if state == 1:
+            raise RuntimeError("out of memory")
+        return super().step(state, measurement)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_a_ros_node_that_is_interrupted_stops_the_arms_and_keeps_the_log(tmp_path, ros, error):
+    run = RobotRun(RobotLink(Failing(), TARGET, LinkConfig()), CABLE, tmp_path / "log.npz")
+    harness, nodes, before = Harness(), [], []
+
+    def interrupted(node):
+        nodes.append(node)
+        for k in range(60):
+            node.now = 100.0 + 0.05 * k
+            seen = harness.seen(node.now)
+            node.callbacks["~/grippers"](pose_array(node.now, seen.gripper_pose[:, :2], seen.gripper_pose[:, 2]))
+            node.callbacks["~/keypoints"](pose_array(node.now, seen.keypoints))
+            if k == 35 and error is KeyboardInterrupt:
+                raise KeyboardInterrupt
+            node.timers[0][1]()
+            before[:] = [node.sent()]
+
+    ros.spin = interrupted
+    with pytest.raises(error):
+        spin(run)
+    assert before[0].any() and not nodes[0].sent().any() and not Node.usable
+    assert read_gap_log(tmp_path / "log.npz").episode_length[0] > 30
 
 
 @pytest.mark.parametrize("rate", [10, 30])
 def test_a_ros_node_takes_poses_that_come_after_the_keypoints(tmp_path, ros, rate):
     """Those of the same moment, which topics deliver in any order."""
     run, harness = run_to(tmp_path / "log.npz", steps=4), Harness()
-    node, moved, last = make_node(run), {}, 0.0
-    [(_, timer)] = node.timers
+    nodes, moved = [], {}
     events = sorted([*((k / rate, 0) for k in range(6 * rate)), *((0.05 * k + 0.001, 1) for k in range(120))])
-    twist = np.zeros((2, 3))
-    with pytest.raises(SystemExit):
+
+    def poses_last(node):
+        nodes.append(node)
+        [(_, timer)] = node.timers
+        last, twist = 0.0, np.zeros((2, 3))
         for moment, is_tick in events:
             harness.pose, last, node.now = harness.pose + (moment - last) * twist, moment, 100.0 + moment
             if is_tick:
                 timer()
-                twists = [node.topics[f"~/gripper_{q}/twist"][-1].twist for q in (0, 1)]
-                twist = np.array([[t.linear.x, t.linear.y, t.angular.z] for t in twists])
+                twist = node.sent()
                 continue
             seen = harness.seen(node.now)
             moved[round(node.now, 6)] = harness.pose[0, 0]
             node.callbacks["~/keypoints"](pose_array(node.now, seen.keypoints))
             node.callbacks["~/grippers"](pose_array(node.now, seen.gripper_pose[:, :2], seen.gripper_pose[:, 2]))
-    assert "paused" not in {message.data.split(":")[0] for message in node.topics["~/status"]}
-    log = read_gap_log(run.finish())
+
+    ros.spin = poses_last
+    log = read_gap_log(spin(run))
+    statuses = [message.data.split(":")[0] for message in nodes[0].topics["~/status"]]
+    assert "paused" not in statuses and statuses[-1] == "done"
     stamps = log.meta["robot_link"]["starts_s"][0] + log.time[0]
     expected = [moved[round(stamp, 6)] for stamp in stamps]
     assert len(stamps) > 4 * rate and np.ptp(expected) > 0.02
@@ -520,15 +579,19 @@ def test_a_ros_node_takes_poses_that_come_after_the_keypoints(tmp_path, ros, rat
 
 def test_a_ros_node_without_fresh_poses_pauses(tmp_path, ros):
     run, harness = run_to(tmp_path / "log.npz"), Harness()
-    node = make_node(run)
-    for k in range(60):
-        node.now = 100.0 + 0.05 * k
-        seen = harness.seen(node.now)
-        if k < 30:
-            node.callbacks["~/grippers"](pose_array(node.now, seen.gripper_pose[:, :2], seen.gripper_pose[:, 2]))
-        node.callbacks["~/grippers"](pose_array(node.now, START[:, :2], frame="camera"))
-        node.callbacks["~/keypoints"](pose_array(node.now, seen.keypoints))
-        node.timers[0][1]()
-    assert node.topics["~/status"][-1].data.startswith("paused")
-    assert not node.topics["~/gripper_0/twist"][-1].twist.linear.x
-    assert any("camera" in warning for warning in node.warnings)
+
+    def no_poses_after_a_while(node):
+        for k in range(60):
+            node.now = 100.0 + 0.05 * k
+            seen = harness.seen(node.now)
+            if k < 30:
+                node.callbacks["~/grippers"](pose_array(node.now, seen.gripper_pose[:, :2], seen.gripper_pose[:, 2]))
+            node.callbacks["~/grippers"](pose_array(node.now, START[:, :2], frame="camera"))
+            node.callbacks["~/keypoints"](pose_array(node.now, seen.keypoints))
+            node.timers[0][1]()
+        assert node.topics["~/status"][-1].data.startswith("paused")
+        assert not node.sent().any()
+        assert any("camera" in warning for warning in node.warnings)
+
+    ros.spin = no_poses_after_a_while
+    spin(run)

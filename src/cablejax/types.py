@@ -101,10 +101,13 @@ class Measurement(NamedTuple):
     Attributes:
         keypoints: observed now [m], NaN = not observed, shape [N, 2].
         gripper_pose: (x, y, theta) of both grippers [m, rad], NaN = not measured, shape [Q, 3].
+        twist: that was commanded since the last step [m/s, rad/s], shape [Q, 3]: what limits beyond the controller left
+            of its own; None = its own.
     """
 
     keypoints: Float[Array | np.ndarray, "*batch N 2"]
     gripper_pose: Float[Array | np.ndarray, "*batch Q 3"]
+    twist: Float[Array | np.ndarray, "*batch Q 3"] | None = None
 
 
 ROTATION_WEIGHT = 0.15

@@ -45,7 +45,8 @@ class LinkConfig:
         interval: time between two commands [s].
         rest: time without motion before the first command and after a pause [s].
         steps: commands after which the run is done; None = goes on.
-        patience: the run is done once the error has stayed within `RESTING_CM` for so many commands; None = never.
+        patience: the run is done once the error has stayed within `RESTING_CM`, or its noise, for so many commands;
+            None = never.
         watchdog: age of the newest usable observation at which the grippers are held [s].
         grace: time for which a command holds beyond the interval while the next one is awaited [s].
         min_seen: share of the keypoints that a usable observation shows.
@@ -134,6 +135,7 @@ class LinkState:
         command: twist in force, since, and until when.
         commands: given so far.
         errors: the last ones at control instants [cm], as many as `patience` needs.
+        at_rest: errors in the last observations before the first command [cm], which tell the noise.
     """
 
     status: Status
@@ -147,4 +149,5 @@ class LinkState:
     command: tuple[np.ndarray, float, float]
     commands: int
     errors: tuple[float, ...]
+    at_rest: tuple[float, ...] = ()
     behind: float = 0.0

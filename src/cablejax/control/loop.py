@@ -54,7 +54,7 @@ def run_closed_loop(
         start: gripper poses (x, y, theta) [m, rad] of the cable at the beginning, shape [Q, 3].
         interval: time that each command is held [s].
         record_hz: samples per second of the recorded episode.
-        patience: end the run once the error has stayed within `RESTING_CM` for so many commands; None = never.
+        patience: as in `LinkConfig`.
 
     Raises:
         ValueError: `steps` is not positive or more than an episode of a log holds, `record_hz` does not divide the

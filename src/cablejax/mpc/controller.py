@@ -29,7 +29,7 @@ from cablejax.mpc.warm_start import find_starts
 from cablejax.residual.jacobian import Corrected, Dynamics, linearised
 from cablejax.residual.learner import Sample, learned, observe
 from cablejax.residual.learner import weights as weights_of
-from cablejax.residual.ridge import apply
+from cablejax.residual.ridge import ResidualModel, apply
 from cablejax.types import History, Measurement
 
 
@@ -87,7 +87,7 @@ class MPC(eqx.Module):
         Args:
             state: from the last step.
             measurement: keypoints and gripper poses now; a keypoint with a NaN counts as not observed, a pose that is
-                NaN as not measured.
+                NaN as not measured. With another twist than the last command, the model is judged by that twist.
 
         Returns:
             The state for the next step, the twist to hold until then (finite and within all bounds) and the report.
@@ -103,6 +103,8 @@ class MPC(eqx.Module):
 def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState, Float[Array, "Q 3"], MPCInfo]:
     """See `MPC.step`."""
     config, dynamics, weights = mpc.config, mpc.dynamics, mpc.weights
+    if measurement.twist is not None:
+        state = _commanded(mpc, state, jnp.asarray(measurement.twist, state.last.twist.dtype))
     state, unobserved = _observe(config, state, measurement)
     model, residual = state.last.model, None
     if config.residual is not None and state.learner is not None:
@@ -126,11 +128,7 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     plan = decision.plan
 
     twist = config.objective.to_twist(plan.motion[0])
-    offline, estimate = _displacement(dynamics, weights, state, twist)
-    online = jnp.zeros_like(offline) if residual is None else apply(residual, twist)
-    newest = state.history.keypoints[-1]
-    moved = newest + offline + online
-    predicted = jnp.where(jnp.isfinite(moved), moved, newest)
+    offline, online, predicted, estimate = _prediction(mpc, state, residual, twist)
     size_offline, size_online = jnp.linalg.norm(offline), jnp.linalg.norm(online)
     info = MPCInfo(
         shape_error=error,
@@ -155,6 +153,29 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
         unobserved=state.unobserved + unobserved,
     )
     return state, twist, info
+
+
+def _commanded(mpc: MPC, state: MPCState, twist: Float[Array, "Q 3"]) -> MPCState:
+    """The state as if this had been the last command: its prediction is then that of what was executed."""
+    config, last, residual = mpc.config, state.last, None
+    if config.residual is not None and state.learner is not None:
+        residual = learned(config.residual, state.learner, last.model)
+    offline, _, predicted, estimate = _prediction(mpc, state, residual, twist)
+    changed = last._replace(twist=twist, displacement=offline, predicted=predicted)
+    changed = dataclasses.replace(state, last=changed, estimate=estimate)
+    # before the first step there was no command
+    return jax.tree.map(lambda new, old: jnp.where(state.steps > 0, new, old), changed, state)
+
+
+def _prediction(
+    mpc: MPC, state: MPCState, residual: ResidualModel | None, twist: Float[Array, "Q 3"]
+) -> tuple[Float[Array, "N 2"], Float[Array, "N 2"], Float[Array, "N 2"], CableEstimate | None]:
+    """Displacements [m] of the offline model and of the residual, keypoints after both, and see `_displacement`."""
+    offline, estimate = _displacement(mpc.dynamics, mpc.weights, state, twist)
+    online = jnp.zeros_like(offline) if residual is None else apply(residual, twist)
+    newest = state.history.keypoints[-1]
+    moved = newest + offline + online
+    return offline, online, jnp.where(jnp.isfinite(moved), moved, newest), estimate
 
 
 def _beliefs(config: MPCConfig, state: MPCState) -> Float[Array, " K"] | None:
@@ -186,7 +207,7 @@ def _observe(config: MPCConfig, state: MPCState, measurement: Measurement) -> tu
     What was not observed is taken from the prediction, and its error is not learned from: neither that of the step
     which led here nor that of the next, which starts from a position not seen.
     """
-    keypoints, gripper_pose = map(jnp.asarray, measurement)
+    keypoints, gripper_pose = jnp.asarray(measurement.keypoints), jnp.asarray(measurement.gripper_pose)
     last, dtype = state.last, state.last.predicted.dtype
     largest = LIMITS["coordinate"].high
     observed = (jnp.abs(keypoints) <= largest).all(axis=-1)

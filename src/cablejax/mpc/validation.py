@@ -95,7 +95,7 @@ def check_dynamics(dynamics: Callable[..., Any], weights: Any, history: History)
 
 def check_measurement(target: Float[Array | np.ndarray, "N 2"], measurement: Measurement) -> None:
     """Raises ValueError unless a measurement has the shape of the target's keypoints and of two grippers' poses."""
-    keypoints, gripper_pose = measurement
+    keypoints, gripper_pose, twist = measurement
     _check_floating("Measured keypoints", keypoints)
     _check_floating("Measured gripper poses", gripper_pose)
     if keypoints.shape != np.shape(target) or gripper_pose.shape != (2, 3):
@@ -103,6 +103,8 @@ def check_measurement(target: Float[Array | np.ndarray, "N 2"], measurement: Mea
             f"Measurement with keypoints {keypoints.shape} and gripper poses {gripper_pose.shape}, "
             f"expected {np.shape(target)} as the target and (2, 3)."
         )
+    if twist is not None and np.shape(twist) != (2, 3):
+        raise ValueError(f"Measurement with a twist of shape {np.shape(twist)}, expected (2, 3).")
 
 
 def _check_floating(what: str, value: object) -> None:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.arrays import wrapped
@@ -119,6 +120,18 @@ class Track(NamedTuple):
     seen: Float[Array, "*b"]
     curvature: Float[Array, "*b"]
     gap: Float[Array, "*b"]
+
+    def observed(self, gripper_pose: Float[np.ndarray, "Q 3"]) -> Float[np.ndarray, "N 2"]:
+        """What a controller may take for an observation: the ends at their grippers, NaN between them while lost.
+
+        Args:
+            gripper_pose: the frame's (x, y, theta) of both grippers [m, rad].
+        """
+        keypoints = np.array(self.keypoints, float)
+        keypoints[[0, -1]] = np.asarray(gripper_pose)[:, :2]
+        if self.status != Status.TRACKED:
+            keypoints[1:-1] = np.nan
+        return keypoints
 
 
 def quality(fit: CurveFit) -> tuple[Array, ...]:

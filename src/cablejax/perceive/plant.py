@@ -76,12 +76,8 @@ class CloudPlant(Plant):
             self._state, self.track = self.tracker.init(self.cloud, truth.gripper_pose)
         else:
             self._state, self.track = self.tracker.step(self._state, self.cloud, truth.gripper_pose)
-        keypoints = np.array(self.track.keypoints, float)
-        keypoints[[0, -1]] = truth.gripper_pose[:, :2]
-        if self.track.status != Status.TRACKED:
-            keypoints[1:-1] = np.nan
-            self.lost += 1
-        return dataclasses.replace(truth, keypoints=keypoints)
+        self.lost += int(self.track.status != Status.TRACKED)
+        return dataclasses.replace(truth, keypoints=self.track.observed(truth.gripper_pose))
 
 
 def tracker_for(cable: Cable) -> TrackerConfig:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import math
+import pathlib
 from typing import Any
 
 import numpy as np
@@ -14,32 +15,66 @@ from cablejax.simulate.table_plant import Observation
 RATE_HZ = 20.0
 """Rate at which the watchdog looks and the command is published."""
 
-_UNKNOWN = np.full((2, 3), np.nan)
+_UNKNOWN, _STILL = np.full((2, 3), np.nan), np.zeros((2, 3))
 _KEPT = 100
 """Messages of the grippers that are looked through, some ticks even at the rate of an arm's controller."""
 
 
-def make_node(run: RobotRun, *, name: str = "cablejax", frame: str = "world") -> Any:
-    """A node for `rclpy.spin`, which raises SystemExit when the run has ended; then call `run.finish()`.
+def spin(run: RobotRun, *, name: str = "cablejax", frame: str = "world") -> pathlib.Path:
+    """Starts rclpy, spins a node until the run has ended, and writes the log.
 
-    Subscribes to `~/keypoints` (geometry_msgs/PoseArray, the positions of all N in their order, NaN where not
+    The node subscribes to `~/keypoints` (geometry_msgs/PoseArray, the positions of all N in their order, NaN where not
     observed) and `~/grippers` (geometry_msgs/PoseArray, both poses; the rotation about z is theta). Each message with
     keypoints is one observation, with its own time stamp and the poses nearest to it, if they are less than one tick
-    older or newer; it waits a tick for them, since topics come in any order. Publishes `~/gripper_0/twist` and
-    `~/gripper_1/twist` (geometry_msgs/TwistStamped) at 20 Hz, zero when a command has ended, and `~/status`
-    (std_msgs/String).
+    older or newer; it waits a tick for them, since topics come in any order. It publishes `~/gripper_0/twist` and
+    `~/gripper_1/twist` (geometry_msgs/TwistStamped) at 20 Hz, zero when a command has ended and at last, also after
+    Ctrl-C and errors, and `~/status` (std_msgs/String). The controller computes between two ticks, so arms need a
+    timeout of their own.
 
     Args:
         run: the run.
         name: of the node.
         frame: of all messages; others are refused.
+
+    Returns:
+        The path of the log, which is also written after Ctrl-C and after an error.
+
+    Raises:
+        GapLogError: nothing usable was observed.
     """
+    import rclpy  # pyright: ignore[reportMissingImports]
+    from rclpy.signals import SignalHandlerOptions  # pyright: ignore[reportMissingImports]
+
+    def drive() -> None:
+        # rclpy's own handler of Ctrl-C shuts the publishers down before the arms could be stopped
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            node = _make_node(run, name, frame)
+            try:
+                rclpy.spin(node)
+            except _Ended:
+                pass
+            finally:
+                node.publish(_STILL)
+                node.destroy_node()
+        finally:
+            rclpy.shutdown()
+
+    return run.recorded(drive)
+
+
+class _Ended(Exception):
+    """The run has ended, which an executor does not look for."""
+
+
+def _make_node(run: RobotRun, name: str, frame: str) -> Any:
+    """See `spin`."""
     from geometry_msgs.msg import PoseArray, TwistStamped  # pyright: ignore[reportMissingImports]
     from rclpy.node import Node  # pyright: ignore[reportMissingImports]
     from std_msgs.msg import String  # pyright: ignore[reportMissingImports]
 
     class ShapeCable(Node):
-        """See `make_node`."""
+        """See `spin`."""
 
         def __init__(self):
             super().__init__(name)
@@ -80,18 +115,25 @@ def make_node(run: RobotRun, *, name: str = "cablejax", frame: str = "world") ->
             return message.header.frame_id == frame
 
         def on_timer(self) -> None:
-            now = self.get_clock().now()
-            reply = run.exchange(1e-9 * now.nanoseconds, self._observations())
-            for publisher, (vx, vy, omega) in zip(self._twists, reply.twist.tolist(), strict=True):
-                message = TwistStamped()
-                message.header.stamp, message.header.frame_id = now.to_msg(), frame
-                message.twist.linear.x, message.twist.linear.y, message.twist.angular.z = vx, vy, omega
-                publisher.publish(message)
+            reply = run.exchange(self._seconds(), self._observations(), self._seconds)
+            self.publish(reply.twist)
             self._status.publish(String(data=f"{reply.status}: {reply.reason}" if reply.reason else str(reply.status)))
             for reason in reply.refused:
                 self.get_logger().warning(reason)
             if reply.status.ended:
-                raise SystemExit
+                raise _Ended
+
+        def _seconds(self) -> float:
+            return 1e-9 * self.get_clock().now().nanoseconds
+
+        def publish(self, twist: np.ndarray) -> None:
+            """Commands both grippers."""
+            now = self.get_clock().now().to_msg()
+            for publisher, (vx, vy, omega) in zip(self._twists, twist.tolist(), strict=True):
+                message = TwistStamped()
+                message.header.stamp, message.header.frame_id = now, frame
+                message.twist.linear.x, message.twist.linear.y, message.twist.angular.z = vx, vy, omega
+                publisher.publish(message)
 
     return ShapeCable()
 

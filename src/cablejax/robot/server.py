@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from cablejax.control.link_state import Reply, Status
-from cablejax.gaplog_check import GapLogError
 from cablejax.limits import require
 from cablejax.robot.session import RobotRun
 from cablejax.simulate.table_plant import Observation
@@ -54,7 +53,8 @@ def serve(
         GapLogError: nothing usable was observed.
         ValueError: the robot sent a line that is too long.
     """
-    try:
+
+    def drive() -> None:
         with socket.create_server((host, port)) as listening:
             ready(listening.getsockname()[1])
             connection, _ = listening.accept()
@@ -63,12 +63,8 @@ def serve(
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.settimeout(None if simulated_clock else TICK)
             _converse(run, connection, simulated_clock)
-    except BaseException:
-        # report the error that ended the run, even if there is no log to keep
-        with contextlib.suppress(GapLogError):
-            run.finish()
-        raise
-    return run.finish()
+
+    return run.recorded(drive)
 
 
 def _converse(run: RobotRun, connection: socket.socket, simulated_clock: bool) -> None:
@@ -85,7 +81,7 @@ def _converse(run: RobotRun, connection: socket.socket, simulated_clock: bool) -
             if isinstance(message, Observation):
                 waiting.append(message)
                 continue
-            reply = run.exchange(message, waiting)
+            reply = run.exchange(message, waiting, None if simulated_clock else time.monotonic)
             if lines or (reply.since, reply.status) != sent:
                 connection.sendall(reply_line(reply, refused))
             run.log.refuse(refused)

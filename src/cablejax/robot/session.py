@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -51,19 +52,22 @@ class RobotRun:
         link.warm_up()
         self._state = link.init()
 
-    def exchange(self, now: float, observations: Sequence[Observation] = ()) -> Reply:
+    def exchange(
+        self, now: float, observations: Sequence[Observation] = (), clock: Callable[[], float] | None = None
+    ) -> Reply:
         """One step of the link. Before the first command the log so far is checked, so that it can be written later.
 
         Args:
             now: the link's clock [s].
             observations: that have come since the last call.
+            clock: see `RobotLink.step`.
         """
         first = self._state.commands == 0
-        self._state, reply = self.link.step(self._state, now, observations)
+        self._state, reply = self.link.step(self._state, now, observations, clock)
         self.log.add(reply)
         if first and reply.status == Status.SHAPING:
             try:
-                fault = setup_fault(self._recorded())
+                fault = setup_fault(self._log())
             except GapLogError as error:
                 fault = str(error)
             if fault:
@@ -75,6 +79,17 @@ class RobotRun:
         """Holds the grippers for good."""
         self._state = self.link.stop(self._state, reason)
         return self.exchange(now)
+
+    def recorded(self, drive: Callable[[], None]) -> pathlib.Path:
+        """Calls what drives the run to its end, and writes the log: see `finish`. After Ctrl-C and errors as well."""
+        try:
+            drive()
+        except BaseException:
+            # report the error that ended the run, even if there is no log to keep
+            with contextlib.suppress(GapLogError):
+                self.finish()
+            raise
+        return self.finish()
 
     def finish(self) -> pathlib.Path:
         """Writes the gap log and returns its path: a free one next to it if that of this run has been taken meanwhile.
@@ -88,7 +103,7 @@ class RobotRun:
         while path.exists() or path.with_suffix(_RAW).exists():
             path = self.path.with_stem(f"{self.path.stem}_{next(count)}")
         try:
-            return write_gap_log(path, self._recorded())
+            return write_gap_log(path, self._log())
         except GapLogError as error:
             kept = path.with_suffix(_RAW)
             pieces = enumerate(self.log.episodes(motion(self.link.target)))
@@ -99,7 +114,7 @@ class RobotRun:
                 f"The recording is not a valid gap log: {error} Its samples are kept in {kept}."
             ) from None
 
-    def _recorded(self) -> GapLog:
+    def _log(self) -> GapLog:
         return self.log.gap_log(self.link.target, self.cable, self.source)
 
     def result(self) -> ClosedLoopRun:
