@@ -35,7 +35,8 @@ from cablejax.recordings.deform import SAMPLE_INTERVAL, repaired_blocks
 from cablejax.spatial.cable import errors
 from cablejax.spatial.caveats import STIFF
 from cablejax.spatial.identify import EDGES, identify
-from cablejax.spatial.named import SURE, named_effects, quantities_of
+from cablejax.spatial.judge import judge
+from cablejax.spatial.named import SURE, quantities_of
 from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish, share
 from real_cables.benchmark import errors_of
@@ -105,7 +106,8 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
     state = None if cache is None else cache / f"{seed}.json"
     found = identify(windows, cable.believed, state=state)
     everything = found.everything
-    effects = [effect.name for effect in named_effects(found, density=1.0)]
+    says = judge(found, density=1.0)
+    effects = [effect.name for effect in says.effects]
     judged = [name for name in effects if name in REPORTED and name in (*present, *UNJUDGED)]
     reported = with_true_values(cable, everything, judged)
     known = quantities_of(found, None)
@@ -129,6 +131,7 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
         "present": present,
         "moved_mm": moved,
         "repairs": len(repairs),
+        "verdict": says.verdict,
         "effects": effects,
         "reported": reported,
         # of all effects, there or not, named or not, without `UNMODELLED`

@@ -9,37 +9,26 @@ from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
-from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
-from cablejax.diagnose.judgement import judged, verdict_sentence
+from cablejax.diagnose.diagnosis import CableDiagnosis, ParameterEstimate, Ranked
+from cablejax.diagnose.judgement import verdict_sentence
 from cablejax.diagnose.log_faults import as_measured
 from cablejax.diagnose.protocol import explanation
 from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.provenance import package_versions
 from cablejax.simulate.rod import Rod, RodResult
-from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
-from cablejax.spatial.cable import SpatialCable, errors
+from cablejax.spatial.accidents import accident_sentences, moderated
+from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.caveats import caveats
 from cablejax.spatial.clock import on_one_clock, with_poses_in_time
-from cablejax.spatial.gap import (
-    constant_offset,
-    gap_of,
-    in_log,
-    own_error,
-    smallest_gap,
-    squares,
-    where_of,
-    with_gap,
-)
+from cablejax.spatial.gap import constant_offset, in_log, squares, where_of
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import EDGES, Identified, identify, layout_of
-from cablejax.spatial.named import named_effects, quantities_of, with_both_drags
+from cablejax.spatial.judge import judge
+from cablejax.spatial.named import quantities_of
 from cablejax.spatial.windows import Windows, windows_of
 from cablejax.types import GapLog
 
-_CALIBRATION = Calibration()
 # Windows by which it is found out whether the roll of a log was observed, and by how much the error has to be smaller.
 _COMPARED, _CLEARLY = 12, 0.9
 
@@ -91,40 +80,27 @@ def diagnose_space(
         progress(change)
     noise = windows.noise
     found = identify(windows, stiffness, cable["bending_damping_s"], only=only, state=state, progress=progress)
-    effects, edges = named_effects(found, density), max(found.cable.edges)
-    named = [effect.name for effect in effects]
-    before, (after, results) = found.cable.motion(explanation()), found.unseen(with_both_drags(named))
-    lost, error, use = _simulated(after, windows)
-    kept_windows = found.cable.chosen(use)
-    compared, smallest, own = with_gap(kept_windows, before[use], noise)
-    cut = _seconds(compared.windows) if compared.windows.valid.sum() < kept_windows.windows.valid.sum() else None
-    gap = gap_of(before[use], after[use], compared, noise, smallest)
-    equivalent = _equivalent(found, named)
-    explaining = found.everything.with_only(with_both_drags(named))
-    own_after = own_error(compared, explaining, compared.motion(explaining), noise)
-    verdict = _verdict(gap, 1e3 * smallest_gap(noise, windows, own_after), named, equivalent)
-    share = gap.shrinkage
-    if verdict == "unknown":  # each effect may be absent: by all of them together
-        share = gap_of(before[use], found.unseen()[0][use], compared, noise, smallest).shrinkage
-    if verdict in ("none", "unknown"):
-        effects = ()
-    offset = ParameterEstimate(constant_offset(after[use], kept_windows.windows), None, "m")
-    nominal, explained = (in_log(log, windows, part) for part in (before, after))
+    says = judge(found, density)
+    counted, after = windows.chosen(says.use), says.after[says.use]
+    cut = _seconds(says.compared.windows) if says.compared.windows.valid.sum() < counted.valid.sum() else None
+    sentence = verdict_sentence(says.verdict, says.effects, says.equivalent, says.share)
+    offset = ParameterEstimate(constant_offset(after, counted), None, "m")
+    nominal, explained = (in_log(log, windows, part) for part in (says.before, says.after))
     return SpatialDiagnosis(
-        verdict=verdict,
-        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, share or 0.0), *changes[:1], *shifted]),
-        effects=effects,
-        equivalent=equivalent,
+        verdict=says.verdict,
+        sentence=" ".join([sentence, *changes[:1], *shifted]),
+        effects=says.effects,
+        equivalent=says.equivalent,
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
         ranking=_ranking(found),
-        gap=gap,
-        where=where_of(log, kept_windows.windows, nominal, before[use], noise, smallest, changes),
+        gap=says.gap,
+        where=where_of(log, counted, nominal, says.before[says.use], noise, says.smallest, changes),
         caveats=(
             *repairs,
             *resampled,
             *shifted,
-            *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *caveats(windows, left_out, found, cut, own, own_after),
+            *accident_sentences(says.lost, says.error, windows, says.results == RodResult.COARSE),
+            *caveats(windows, left_out, found, cut, says.own, says.own_after),
         ),
         log=log,
         nominal=nominal,
@@ -132,7 +108,12 @@ def diagnose_space(
         noise_mm=np.full(windows.n_keypoints, 1e3 * noise),
         noise_correlation=np.zeros(0),
         seconds=time.perf_counter() - begun,
-        settings={"edges": edges, "window_s": longest, **package_versions(("jax",)), "devices": jax.default_backend()},
+        settings={
+            "edges": max(found.cable.edges),
+            "window_s": longest,
+            **package_versions(("jax",)),
+            "devices": jax.default_backend(),
+        },
         identified=found,
     )
 
@@ -158,13 +139,6 @@ def _to_fit(log: GapLog) -> tuple[Windows, int]:
     return fitted, len(windows) - len(fitted)
 
 
-def _simulated(after: Float[np.ndarray, "W T F 3"], windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which windows the simulation lost, the error of each [m], and the indices of those that count."""
-    lost = ~np.array([np.isfinite(part[valid]).all() for part, valid in zip(after, windows.valid, strict=True)])
-    error = errors(after, windows)
-    return lost, error, np.flatnonzero(kept(lost | off(error) | windows.torn))
-
-
 def with_roll(log: GapLog) -> GapLog:
     """Adds `roll_observed` to a log that does not state whether its quaternions show how the grippers roll.
 
@@ -185,24 +159,6 @@ def with_roll(log: GapLog) -> GapLog:
         motion = SpatialCable(Rod(EDGES, 1, twisting=False), layout, windows).motion(explanation())
         sizes.append(float(np.sqrt(np.nanmean(squares(motion, windows)))))
     return told if sizes[1] < _CLEARLY * sizes[0] else log
-
-
-def _verdict(gap: Gap, smallest_mm: float, named: Sequence[str], equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
-    allowed = max(_CALIBRATION.adequate * gap.before_rmse_mm, smallest_mm)
-    return judged(
-        resolvable=gap.shrinkage is not None,
-        telling=bool(named) and gap.shrinkage_ci90 is not None and gap.shrinkage_ci90[0] > 0,
-        complete=gap.after_rmse_mm <= allowed,
-        alike=bool(equivalent),
-    )
-
-
-def _equivalent(found: Identified, named: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """Rest curvature and a stiffness profile that take each other's place equally well."""
-    swap = next((step for step in found.steps if step.instead_of), None)
-    if swap is None or swap.accepted or swap.chance < 0.05 or swap.instead_of not in named:
-        return ()
-    return ((swap.instead_of, swap.effect),)
 
 
 def _ranking(found: Identified) -> tuple[Ranked, ...]:
