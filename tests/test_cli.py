@@ -165,6 +165,13 @@ def test_a_data_set_is_not_overwritten_with_files_of_the_user_in_it(tmp_path, ca
     assert main([*simulate, "--steps", "2"]) == 0
 
 
+def test_overwrite_repairs_or_replaces_a_damaged_data_set(tmp_path, capsys):
+    simulate = ["simulate", "--trajectories", "1", "--links", "5", "--out", str(tmp_path / "data"), "--overwrite"]
+    for steps in ("1", "1", "2"):
+        assert main([*simulate, "--steps", steps]) == 0, capsys.readouterr().err
+        (tmp_path / "data" / "attempts" / "zarr.json").write_text("{")
+
+
 def test_output_folder_that_exists_is_refused_unless_overwritten(tmp_path):
     (tmp_path / "old.txt").write_text("mine")
     with pytest.raises(options.UsageError, match=r"exists and is not empty.*--overwrite"):

@@ -169,13 +169,13 @@ def _clear(place: pathlib.Path | Bucket, config: DatasetConfig) -> None:
     """Deletes a data set of another configuration; refuses what is none, holds other files, or is being written."""
     from cablejax.dataset.bucket import Bucket
     from cablejax.dataset.generate import WRITER
-    from cablejax.dataset.opening import open_store
+    from cablejax.dataset.opening import recorded_store
 
     if isinstance(place, Bucket):
         names = place.names()
     else:
         names = [file.name for file in place.iterdir()] if place.is_dir() else []
-    if not names or (old := open_store(str(place))).config == config:
+    if not names or (old := recorded_store(place)).config == config:
         return
     others = {name.partition("/")[0] for name in names} - old.names
     if others := sorted(name for name in others if not name.startswith(WRITER)):

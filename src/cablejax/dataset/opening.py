@@ -42,7 +42,7 @@ def open_store(path: str | os.PathLike[str]) -> Store:
     Raises:
         ValueError: there is no data set, or one of a newer schema version; older ones are read.
     """
-    store = _recorded(place_of(path), "r")
+    store = recorded_store(place_of(path))
     for name in _arrays(store.config):
         if fault := _fault(store, name):
             raise ValueError(
@@ -52,8 +52,12 @@ def open_store(path: str | os.PathLike[str]) -> Store:
     return store
 
 
-def _recorded(path: Path | Bucket, mode: Literal["r", "r+"]) -> Store:
-    """The data set that a folder says it holds, without a look at its arrays."""
+def recorded_store(path: Path | Bucket, mode: Literal["r", "r+"] = "r") -> Store:
+    """The data set that a folder says it holds; its arrays are not read and may be damaged.
+
+    Raises:
+        ValueError: there is no data set, its description is damaged, or it is of a newer schema version.
+    """
     there = path.read("zarr.json") if isinstance(path, Bucket) else (path / "zarr.json").is_file() or None
     if there is None:
         raise ValueError(
@@ -135,7 +139,7 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
         )
     elif not place.is_dir() or not any(place.iterdir()):
         _create(place, config, versions)
-    store = _recorded(place, "r+")
+    store = recorded_store(place, "r+")
     changes = _changes(store.recorded, config_to_json(config))
     if changes:
         raise ValueError(
@@ -157,7 +161,7 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
         (place / name).parent.mkdir(exist_ok=True)
         with whole_file(place / name) as stream:
             stream.write(descriptions[name])
-    return _recorded(place, "r+") if faulty else store
+    return recorded_store(place, "r+") if faulty else store
 
 
 def _changes(stored: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
