@@ -160,6 +160,12 @@ def test_a_training_is_overwritten_on_request_and_nothing_else(tmp_path):
     assert {name: stored[name] for name in second} == second
 
 
+def test_a_folder_in_which_checkpoints_cannot_be_written_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"caf.* is no UTF-8.*Name another folder"):
+        claim_folder(tmp_path / "caf\udce9" / "run", {"config": {}, "data": "a"}, overwrite=False)
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_training_that_goes_on_with_other_packages_says_so(tmp_path):
     run, lines = {"config": {"seed": 0}, "data": "a"}, []
 

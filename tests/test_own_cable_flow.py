@@ -13,6 +13,7 @@ from cablejax.cli import main
 from cablejax.commands.cable import find_cable
 from cablejax.commands.runs import plant_of
 from cablejax.diagnose.safe_motions import safe_motions
+from cablejax.dynamics.weights import load_info
 from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.gaplog import Episode, gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.simulate.plant import Plant, PlantConfig
@@ -57,6 +58,14 @@ def test_data_and_weights_hold_the_cable_and_the_card_says_how_to_make_them_agai
     card = (folder / "model" / "card.md").read_text()
     assert "cablejax cable --from model --out cable.toml\ncablejax simulate --out data.zarr" in card
     assert "--cable cable.toml" in card
+
+
+def test_data_whose_name_is_no_utf_8_are_trained_on(folder, capsys):
+    data, out = folder / "caf\udce9.zarr", folder / "latin1"
+    data.symlink_to("data.zarr")
+    result_of(["train", "--data", str(data), "--out", str(out), "--held-out", "0.3", *SMALL], capsys)
+    assert load_info(out)["data"][0]["name"] == "caf?"
+    assert "caf?.zarr" in (out / "card.md").read_text()
 
 
 def test_another_training_in_its_folder_is_told_apart_in_words(folder, capsys):

@@ -100,7 +100,7 @@ def write_card(
         "```",
         "",
     ]
-    Path(path).write_text("\n".join(lines), encoding="utf-8")
+    Path(path).write_text("\n".join(lines), encoding="utf-8", errors="replace")
 
 
 def _curve(metrics: Path) -> list[str]:

@@ -44,10 +44,17 @@ def claim_folder(
         report: called with a line of text if other versions of the packages began this very training.
 
     Raises:
-        ValueError: the folder holds another run, or something else without `overwrite`.
+        ValueError: the folder holds another run, or something else without `overwrite`, or its name is no UTF-8.
     """
     if out_dir.exists() and not out_dir.is_dir():
         raise ValueError(f"{out_dir} is a file, expected a folder for the training. Name another one.")
+    try:
+        str(out_dir.absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise ValueError(
+            f"The name of {out_dir.absolute()} is no UTF-8, and checkpoints cannot be written there. Name another "
+            "folder (--out)."
+        ) from error
     path = out_dir / RUN
     run, versions = {"schema": SCHEMA, **json.loads(json.dumps(run))}, package_versions(PACKAGES)
     if path.exists():

@@ -35,7 +35,7 @@ from cablejax.dynamics.config import RECORDED, ModelConfig, Normalisation
 from cablejax.dynamics.model import structure_of
 from cablejax.limits import require
 from cablejax.simulate.chain.statics import Statics
-from cablejax.text_file import parse_json, version_of
+from cablejax.text_file import json_text, parse_json, version_of
 from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-weights/1"
@@ -72,7 +72,7 @@ def save_weights(
     tensors = {name: np.asarray(leaf) for name, leaf in _named(weights).items()}
     _check_tensors(tensors, _named(structure_of(model_config)[1]), f"The weights to be saved in {path}")
     content = {"schema": SCHEMA, "config": RECORDED | dataclasses.asdict(model_config), "info": dict(info)}
-    content = json.loads(json.dumps(content, allow_nan=False))  # as it will be read
+    content = json.loads(json_text(content, allow_nan=False))  # as it will be read
     data = save(tensors, metadata={_KEY: json.dumps(content | {"digest": _digest(tensors, content)})})
     with whole_file(path) as stream:
         stream.write(data)
