@@ -15,12 +15,14 @@ from cablejax.gaplog import (
     TARGETS,
     Episode,
     GapLogError,
+    episodes_of,
     gap_log_from_episodes,
     read_gap_log,
     read_simulated,
     targets_of,
     write_gap_log,
 )
+from cablejax.gaplog_join import joined
 from cablejax.poses import poses_from_markers, twists
 from cablejax.recordings.lerobot import read_lerobot, write_lerobot
 from cablejax.recordings.mcap_log import read_mcap, write_mcap
@@ -337,3 +339,21 @@ def test_fields_of_other_programs_may_hold_what_json_has_no_word_for(tmp_path):
     log.meta["theirs"] = {"offset": float("nan")}
     for write, read, name in FORMATS.values():
         assert np.isnan(read(write(tmp_path / name, log)).meta["theirs"]["offset"])
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_log_with_numpys_numbers_comes_back_and_is_joined(name, tmp_path):
+    write, read, file = FORMATS[name]
+    needs("mcap" if name == "mcap" else "pyarrow")
+    theirs = {"gain": np.float32(1.5), "offsets": np.arange(3), "file": "caf\udce9.csv"}
+    log, other = (
+        gap_log_from_episodes(episodes_of(planar())[e : e + 1], Cable(), source="test", extra={"theirs": theirs})
+        for e in range(2)
+    )
+    plain = {"gain": 1.5, "offsets": [0, 1, 2], "file": "caf?.csv"}
+    assert joined([log, other], ["a", "b"]).meta["theirs"] == plain
+    log.meta["theirs"] = theirs
+    assert read(write(tmp_path / file, log)).meta["theirs"] == plain
+    log.meta["theirs"] = object()
+    with pytest.raises(GapLogError, match=r"Field 'meta' cannot be written: .* is no value that JSON has"):
+        write(tmp_path / f"other {file}", log)

@@ -16,10 +16,10 @@ from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable
 from cablejax.cable_file import NUMBERS
-from cablejax.gaplog_check import DTYPES, META_FIELDS, SCHEMA, GapLogError, validate
+from cablejax.gaplog_check import DTYPES, META_FIELDS, SCHEMA, GapLogError, meta_text, validate
 from cablejax.limits import LIMITS, require
 from cablejax.npz import NpzError, read_npz
-from cablejax.text_file import json_text, parse_json
+from cablejax.text_file import parse_json
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
 
@@ -96,11 +96,11 @@ def stack_episodes(episodes: Sequence[Episode], meta: Mapping[str, Any], *, hold
 
     Args:
         episodes: at least one.
-        meta: of the log, complete.
+        meta: of the log, complete; NumPy's numbers and arrays become plain ones.
         holds: whether the log says when the grippers rest.
 
     Raises:
-        GapLogError: episodes that do not fit each other or the format.
+        GapLogError: episodes that do not fit each other or the format, or `meta` that JSON cannot hold.
     """
     lengths = [len(episode.time) for episode in episodes]
 
@@ -135,7 +135,7 @@ def stack_episodes(episodes: Sequence[Episode], meta: Mapping[str, Any], *, hold
         gripper_command=padded("gripper_command", 0.0),
         episode_length=np.array(lengths, np.int32),
         hold=padded("hold", False) if holds else None,
-        meta=dict(meta),
+        meta=parse_json(meta_text(meta)),
     )
     validate(log)
     return log
@@ -205,10 +205,7 @@ def write_gap_log(
                 f"of shape {log.keypoints.shape}."
             )
         arrays[name] = np.asarray(points, np.float32)
-    try:
-        meta = json_text(log.meta)
-    except ValueError as error:
-        raise GapLogError(f"Field 'meta' cannot be written: {error}") from None
+    meta = meta_text(log.meta)
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as stream:
         np.savez_compressed(stream, allow_pickle=False, meta=np.array(meta), **arrays)

@@ -6,7 +6,7 @@ import contextlib
 import difflib
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from cablejax.cable_file import NUMBERS, cable_from_fields
 from cablejax.limits import LIMITS, require, shown
 from cablejax.log_geometry import geometry_fault
-from cablejax.text_file import unknown_key, version_of
+from cablejax.text_file import json_text, unknown_key, version_of
 from cablejax.types import GapLog
 
 SCHEMA = "cablejax-gap-log/1"
@@ -60,6 +60,14 @@ def reading_export(path: os.PathLike[str]) -> Iterator[None]:
         raise GapLogError(
             f"{path} could not be read ({type(error).__name__}: {error}). Export the log again."
         ) from error
+
+
+def meta_text(meta: Mapping[str, Any], indent: int | None = None) -> str:
+    """JSON of the `meta` of a log, NaN included; raises `GapLogError` if JSON cannot hold it."""
+    try:
+        return json_text(dict(meta), indent=indent)
+    except ValueError as error:
+        raise GapLogError(f"Field 'meta' cannot be written: {error}") from None
 
 
 def validate(log: GapLog) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from cablejax.extras import from_extra
 from cablejax.gaplog import Episode, episodes_of, stack_episodes
-from cablejax.gaplog_check import SCHEMA, GapLogError, reading_export
+from cablejax.gaplog_check import SCHEMA, GapLogError, meta_text, reading_export
 from cablejax.limits import require
 from cablejax.text_file import read_json, write_json
 from cablejax.types import GapLog
@@ -55,6 +55,7 @@ def write_lerobot(folder: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
 
     Raises:
         FileExistsError: there is such a folder or file.
+        GapLogError: `meta` has a field that JSON cannot hold.
         ValueError: the library pyarrow is not installed.
     """
     arrow, folder = _pyarrow("pyarrow"), pathlib.Path(folder)
@@ -72,8 +73,7 @@ def write_lerobot(folder: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
         _write_tasks(arrow, draft / "meta/tasks.parquet", tasks)
         write_json(draft / "meta/info.json", _info(log, _features(columns, log), len(columns["index"]), len(tasks)))
         write_json(draft / "meta/stats.json", {name: _statistics(column) for name, column in columns.items()})
-        # fields of other programs may hold NaN
-        (draft / _LOG).write_text(json.dumps(log.meta, indent=2) + "\n")
+        (draft / _LOG).write_text(f"{meta_text(log.meta, indent=2)}\n", encoding="utf-8")
         draft.rename(folder)
     return folder
 

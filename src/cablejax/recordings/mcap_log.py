@@ -24,7 +24,7 @@ import numpy as np
 from cablejax import __version__
 from cablejax.extras import from_extra
 from cablejax.gaplog import Episode, episodes_of, stack_episodes
-from cablejax.gaplog_check import SCHEMA, GapLogError, reading_export
+from cablejax.gaplog_check import SCHEMA, GapLogError, meta_text, reading_export
 from cablejax.limits import require
 from cablejax.simulate.pose import points_in_space, pose_in_space
 from cablejax.types import GapLog
@@ -46,6 +46,7 @@ def write_mcap(path: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
     """Writes a gap log as an MCAP file, whole or not at all, over what was there, and returns its path.
 
     Raises:
+        GapLogError: `meta` has a field that JSON cannot hold.
         ValueError: the library mcap is not installed.
     """
     library, path = _mcap("mcap.writer"), pathlib.Path(path)
@@ -53,7 +54,7 @@ def write_mcap(path: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
     with whole_file(path) as stream:
         writer = library.Writer(stream, enable_data_crcs=True)
         writer.start(profile="", library=_LIBRARY + __version__)
-        writer.add_metadata(SCHEMA, {"meta": json.dumps(log.meta)})
+        writer.add_metadata(SCHEMA, {"meta": meta_text(log.meta)})
         channels = {}
         for topic, (name, fields) in _SCHEMAS.items():
             schema = writer.register_schema(name, "jsonschema", json.dumps({"title": name, **fields}).encode())
