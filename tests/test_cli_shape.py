@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from cablejax.cli import main
 from cablejax.commands import runs
 from cablejax.control.targets import straight_start
 from cablejax.diagnose.motion_file import commands_log
-from cablejax.gaplog import read_gap_log, write_gap_log
+from cablejax.gaplog import episodes_of, read_gap_log, stack_episodes, write_gap_log
 from cli_cases import small_model
 
 SHAPE_KEYS = {
@@ -104,6 +105,20 @@ def test_a_motion_at_thirty_hertz_is_played_and_one_without_commands_refused(tmp
     np.testing.assert_allclose(played.gripper_pose, log.gripper_pose, atol=1e-4)
     assert main([*play, str(tmp_path / "still.npz"), "--overwrite"]) == 2
     assert "The motion has no commands, but its grippers move by 0.01 m" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("rates", "message"), [((3, 6), ""), ((25, 30), "episodes at 25 to 30 samples a second.*chosen")]
+)
+def test_episodes_of_other_rates_are_played_where_one_time_step_fits(rates, message, tmp_path, capsys):
+    poses = np.repeat(straight_start(Cable())[None], 3, axis=0)
+    logs = [commands_log({"rest": poses}, 1 / rate, Cable()) for rate in rates]
+    log = stack_episodes([one for log in logs for one in episodes_of(log)], {**logs[0].meta, "motion": ["rest"] * 2})
+    write_gap_log(tmp_path / "motion.npz", log)
+    play = ["shape", "--links", "8", "--out", str(tmp_path / "run"), "--motion", str(tmp_path / "motion.npz")]
+    assert main(play) == (2 if message else 0)
+    assert re.search(message, capsys.readouterr().err)
+    assert (tmp_path / "run").exists() is not bool(message)
 
 
 def test_a_motion_that_cannot_be_played_leaves_no_empty_folder(tmp_path, capsys):

@@ -146,7 +146,7 @@ class Shape(Command):
         from cablejax.commands.runs import plant_of
         from cablejax.gaplog import read_gap_log, write_gap_log
         from cablejax.simulate.plant import Plant
-        from cablejax.simulate.play import play
+        from cablejax.simulate.play import even_intervals, play
 
         commands, cable = read_gap_log(path), find_cable(path if self.cable is None else self.cable)
         if abs(cable.length - (planned := commands.meta["cable"]["length_m"])) > 0.01 * planned:
@@ -155,10 +155,19 @@ class Shape(Command):
                 "which it may tear or fold: give a cable of that length, or leave --cable out."
             )
         plant = plant_of(cable, effects, links=self.links, seed=self.seed)
-        if len(commands.intervals):
-            # a motion at 30 Hz, of which no time step of the plant is a part
-            fitting = plant.discretisation.dividing(round(float(commands.intervals[0]), 9))
-            plant = dataclasses.replace(plant, discretisation=fitting)
+        shortest, *others = sorted(set(even_intervals(commands)))
+        # a motion at 30 Hz, of which no time step of the plant is a part
+        fitting = plant.discretisation.dividing(shortest)
+        try:
+            for interval in others:
+                fitting.steps_in(interval)
+        except ValueError as error:
+            raise UsageError(
+                f"{path} has episodes at {1 / others[-1]:.6g} to {1 / shortest:.6g} samples a second, expected one "
+                "rate, or rates that one time step fits: write the episodes of each rate to a log of their own "
+                "(cablejax.gaplog_join.chosen) and play these in turn."
+            ) from error
+        plant = dataclasses.replace(plant, discretisation=fitting)
         noise = 1e-3 * (self.noise_mm or 0.0)
         settings = {"motion": commands.meta, "plant": dataclasses.asdict(plant), "noise": noise}
         with unfinished(self.out, settings, overwrite=self.overwrite):

@@ -51,6 +51,28 @@ def play(plant: TablePlant, log: GapLog, *, source: str, noise: float = 0.0, see
             "a next_motion.npz of `cablejax diagnose`."
         )
     episodes, random = [], np.random.default_rng(seed)
+    for e, (length, interval) in enumerate(zip(log.episode_length, even_intervals(log), strict=True)):
+        episodes.append(
+            played(
+                plant,
+                log.gripper_pose[e, 0].astype(float),
+                log.gripper_command[e, :length].astype(float),
+                interval,
+                motion=log.meta["motion"][e],
+                noise=noise,
+                random=random,
+            )
+        )
+    return gap_log_from_episodes(episodes, plant.config.cable, source=source)
+
+
+def even_intervals(log: GapLog) -> list[float]:
+    """The time between samples of each episode [s].
+
+    Raises:
+        ValueError: an episode has too few samples or an uneven clock.
+    """
+    intervals = []
     for e, length in enumerate(log.episode_length):
         steps = np.diff(log.time[e, :length])
         if length < 2 or np.ptp(steps) > 1e-6:
@@ -58,18 +80,8 @@ def play(plant: TablePlant, log: GapLog, *, source: str, noise: float = 0.0, see
                 f"Episode {e} of the motion has {length} samples on {'an uneven' if length > 1 else 'no'} clock, "
                 "expected at least two samples on an even one."
             )
-        episodes.append(
-            played(
-                plant,
-                log.gripper_pose[e, 0].astype(float),
-                log.gripper_command[e, :length].astype(float),
-                float(np.round(steps.mean(), 9)),
-                motion=log.meta["motion"][e],
-                noise=noise,
-                random=random,
-            )
-        )
-    return gap_log_from_episodes(episodes, plant.config.cable, source=source)
+        intervals.append(float(np.round(steps.mean(), 9)))
+    return intervals
 
 
 def played(
