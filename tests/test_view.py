@@ -58,6 +58,12 @@ def test_a_log(log, said, tmp_path, capsys):
     view(capsys, path, "--overwrite")
 
 
+def test_a_log_whose_episodes_were_recorded_at_two_rates():
+    log = planar()
+    log.time[1] *= 2.0
+    assert log_sheet(log, "log.npz").cards[0] == ("Samples", "21", "5 to 10 per second")
+
+
 def test_episodes_without_a_name_of_their_own_are_numbered_in_the_figures():
     log = dataclasses.replace(planar(), meta={**planar().meta, "motion": ["recorded"] * 2})
     (shapes, said), (course, _) = log_sheet(log, "log.npz").figures

@@ -189,3 +189,11 @@ class GapLog:
     def intervals(self) -> np.ndarray:
         """Times between neighbouring samples of all episodes, in order [s], shape [S]."""
         return np.diff(self.time, axis=1)[self.valid[:, 1:]]
+
+    @property
+    def rate(self) -> str:
+        """Usual samples a second: "100", or "29.97 to 60" where episodes differ; "" if each has only one sample."""
+        rates = [
+            1 / np.median(np.diff(one[:n])) for one, n in zip(self.time, self.episode_length, strict=True) if n > 1
+        ]
+        return " to ".join(dict.fromkeys(f"{end(rates):.4g}" for end in (min, max) if rates))

@@ -154,9 +154,7 @@ def _described(path: pathlib.Path, log: GapLog, repairs: Sequence[str]) -> tuple
         "observed": seen,
         "repairs": list(repairs),
     }
-    rates = [1 / np.median(np.diff(one[:n])) for one, n in zip(log.time, log.episode_length, strict=True) if n > 1]
-    ends = dict.fromkeys(f"{end(rates):.4g}" for end in (min, max) if rates)
-    rate = f" at {' to '.join(ends)} Hz" if rates else ""
+    rate = f" at {log.rate} Hz" if log.rate else ""
     line = (
         f"{path}: {counted(len(log.keypoints), 'episode')}, {counted(len(points), 'sample')} "
         f"({log.intervals.sum():.4g} s{rate}) of {points.shape[1]} "

@@ -32,7 +32,7 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
     """What a gap log holds; `exported` is the format of one that has to be imported first, as the command has it."""
     episodes, targets, planar = episodes_of(log), targets_of(log), not log.in_space
     cable = dataclasses.replace(config_of_log(log).cable, diameter=log.meta["cable"]["diameter_m"])
-    points, steps = log.keypoints[log.valid], log.intervals
+    points = log.keypoints[log.valid]
     seen = np.asarray(np.isfinite(points).all(axis=-1))
     noise, how = _noise(log)
     file = shlex.quote(name)
@@ -45,10 +45,10 @@ def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
     return Sheet(
         kind="gap log",
         title=f"{counted(len(episodes), 'episode')} of a cable of {cable.length:g} m "
-        f"{'on a table' if planar else 'in space'}, {steps.sum():.0f} s in all",
+        f"{'on a table' if planar else 'in space'}, {log.intervals.sum():.0f} s in all",
         lead=f"{name}: {log.meta['source']}",
         cards=[
-            ("Samples", f"{len(seen)}", f"{1 / np.median(steps):.4g} per second" if len(steps) else "one per episode"),
+            ("Samples", f"{len(seen)}", f"{log.rate} per second" if log.rate else "one per episode"),
             ("Noise of a coordinate", noise, how),
             ("Observed", f"{100 * seen.mean():.4g} %", f"of {seen.shape[1]} keypoints in all samples"),
             ("Range of the keypoints [m]", ranges, ""),
