@@ -396,5 +396,11 @@ def test_wrong_options_and_actions_are_refused():
         env.reset(options={"targte": "S"})
     with pytest.raises(ValueError, match=r"'bending_stiffness:ratio=2', expected a list"):
         env.reset(options={"effects": "bending_stiffness:ratio=2"})
+    for options in ([], ["target"]):
+        with pytest.raises(ValueError, match=r"options is of type list, expected a dictionary with target or effects"):
+            env.reset(options=options)  # pyright: ignore[reportArgumentType]
+    env.reset()
+    with pytest.raises(ValueError, match=r"actions have complex values, expected real numbers"):
+        env.step(np.zeros((2, 3), complex))
     with pytest.raises(ValueError, match=r"action has shape \(6,\), expected \(2, 3\)"):
         env.step(np.zeros(6))

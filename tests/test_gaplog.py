@@ -207,6 +207,8 @@ def test_masks_and_episodes_without_samples_are_refused():
     hidden[3, 2] = np.ma.masked
     with pytest.raises(GapLogError, match=r"keypoints is a masked array.*write NaN"):
         log_of_episode(dataclasses.replace(one, keypoints=hidden))
+    with pytest.raises(GapLogError, match=r"keypoints is an array of complex128, expected real numbers"):
+        log_of_episode(dataclasses.replace(one, keypoints=one.keypoints.astype(complex)))
     with pytest.raises(GapLogError, match="no sample, expected at least one"):
         log_of_episode(episode(0))
 

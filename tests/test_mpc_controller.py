@@ -536,6 +536,8 @@ def test_impossible_settings_are_refused(change, message):
 def test_impossible_inputs_are_refused():
     with pytest.raises(ValueError, match="non-finite"):
         MPC(CONFIG, relaxing_cable, jnp.ones(()), hermite_shape(START, N).at[2].set(jnp.nan))
+    with pytest.raises(ValueError, match=r"shape \(7, 2\) and complex values, expected finite real keypoints"):
+        MPC(CONFIG, relaxing_cable, jnp.ones(()), np.asarray(hermite_shape(START, N), complex))
     with pytest.raises(ValueError, match="three or more"):
         MPC(CONFIG, relaxing_cable, jnp.ones(()), hermite_shape(START, 2))
     with pytest.raises(ValueError, match=r"max_iterations is 1\.5, expected a whole number from 1"):

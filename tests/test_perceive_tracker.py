@@ -189,6 +189,12 @@ def test_what_cannot_be_a_cloud_is_refused(tracker, started):
         tracker.init(np.zeros((5, 4)), ARCH)
     with pytest.raises(ValueError, match="gripper_pose"):
         tracker.init(np.zeros((5, 2)), np.full((2, 3), np.nan))
+    with pytest.raises(ValueError, match=r"type complex128, expected real numbers of shape"):
+        tracker.init(np.zeros((5, 2), complex), ARCH)
+    with pytest.raises(ValueError, match=r"gripper_pose has complex values, expected real numbers"):
+        tracker.init(np.zeros((5, 2)), ARCH + 0j)
+    with pytest.raises(ValueError, match=r"config is of type NoneType, expected a TrackerConfig"):
+        Tracker(None)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="min_support"):
         TrackerConfig(min_support=2.0)
     with pytest.raises(ValueError, match="capacity"):

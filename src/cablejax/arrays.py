@@ -1,4 +1,4 @@
-"""Array helpers for all stages: flags, choices, unobserved points, angles, lengths, quarter turns, quaternions."""
+"""Array helpers for all stages: checks, flags, choices, unobserved points, angles, lengths, turns, quaternions."""
 
 from __future__ import annotations
 
@@ -7,6 +7,22 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+
+def real(values: object, what: str) -> np.ndarray:
+    """The values in double precision, as a new array.
+
+    Raises:
+        ValueError: they are not real numbers; `what` begins the message, for example "The actions have".
+    """
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind in "biuf":
+            return array.astype(float)
+        came = "complex values" if array.dtype.kind == "c" else f"values of type {array.dtype}"
+    except ValueError:
+        came = "rows of different lengths"
+    raise ValueError(f"{what} {came}, expected real numbers.")
 
 
 def stretches(flags: Bool[np.ndarray, " T"]) -> Int[np.ndarray, "S 2"]:

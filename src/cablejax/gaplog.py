@@ -114,6 +114,8 @@ def stack_episodes(episodes: Sequence[Episode], meta: Mapping[str, Any], *, hold
         arrays = [np.asarray(array) for array in given]
         rest = arrays[0].shape[1:]
         for array, length in zip(arrays, lengths, strict=True):
+            if np.iscomplexobj(array):
+                raise GapLogError(f"An episode's {name} is an array of {array.dtype}, expected real numbers.")
             if not length:
                 raise GapLogError("An episode has no sample, expected at least one.")
             if array.shape != (length, *rest):

@@ -14,7 +14,7 @@ import itertools
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from cablejax.arrays import positions_at, quaternion_product, wrapped
+from cablejax.arrays import positions_at, quaternion_product, real, wrapped
 
 _X = np.array([1.0, 0.0, 0.0])
 
@@ -30,9 +30,9 @@ def planar_rows(value: Float[ArrayLike, "2 3"], name: str) -> Float[np.ndarray, 
     """Poses or twists of two grippers in the plane, in double precision, as a new array.
 
     Raises:
-        ValueError: another shape, or not finite; calls them `name`.
+        ValueError: another shape, or not finite real numbers; calls them `name`.
     """
-    array = np.array(value, dtype=float)
+    array = real(value, f"{name} has")
     if array.shape != (2, 3):
         raise ValueError(f"{name} has shape {array.shape}, expected (2, 3): one planar row for each of two grippers.")
     if not np.isfinite(array).all():

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import real
 from cablejax.cable import Cable
 from cablejax.limits import LIMITS
 from cablejax.npz import read_npz
@@ -143,7 +144,7 @@ def target_from_keypoints(
         ValueError: another number of points, points that are not finite, a cable of another length, or grippers that
             do not hold its ends.
     """
-    points = _real(keypoints, f"Target {name!r} has keypoints")
+    points = real(keypoints, f"Target {name!r} has keypoints of")
     if points.ndim != 2 or points.shape[1:] != (2,):
         raise ValueError(f"Target {name!r} has keypoints of shape {points.shape}, expected ({config.n_keypoints}, 2).")
     if len(points) != config.n_keypoints:
@@ -182,7 +183,7 @@ def target_from_keypoints(
         ends = angle[[0, -1]] + 0.5 * bend[[0, -1]] * [-1, 1]
         pose = np.concatenate([points[[0, -1]], ends[:, None]], axis=1)
     else:
-        pose = _real(gripper_pose, f"Target {name!r} has a gripper_pose")
+        pose = real(gripper_pose, f"Target {name!r} has a gripper_pose of")
         if pose.shape != (2, 3) or not np.isfinite(pose).all():
             raise ValueError(f"Target {name!r} has a gripper_pose not finite or of shape {pose.shape}, not (2, 3).")
         gap = np.abs(pose[:, :2] - points[[0, -1]]).max()
@@ -220,18 +221,6 @@ def load_target(path: str | pathlib.Path, config: Cable = Cable()) -> Target:
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path} could not be read as a target: {error}") from error
     return target_from_keypoints(path.stem, fields["keypoints"], config, fields.get("gripper_pose"))
-
-
-def _real(values: object, what: str) -> np.ndarray:
-    """The values in double precision; raises ValueError unless they are real numbers."""
-    try:
-        array = np.asarray(values)
-        if array.dtype.kind in "biuf":
-            return array.astype(float)
-        came = "complex values" if array.dtype.kind == "c" else f"values of type {array.dtype}"
-    except ValueError:
-        came = "rows of different lengths"
-    raise ValueError(f"{what} of {came}, expected real numbers.")
 
 
 def _read_json(path: pathlib.Path) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from cablejax.arrays import real
 from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import Shape, Target, straight_start
 from cablejax.dataset.drawing import cable_params, draw_parameters
@@ -134,7 +135,7 @@ class Cables:
         config, shape = self.config, (len(self.taken), 2, 3)
         if np.shape(actions) != shape:
             raise ValueError(f"The actions have shape {np.shape(actions)}, expected {shape}: (vx, vy, omega) of each.")
-        twists = config.twist(np.asarray(actions, float), self.gripper_pose) * active[:, None, None]
+        twists = config.twist(real(actions, "The actions have"), self.gripper_pose) * active[:, None, None]
         after, shown = self._engine.rollout(self._physics, self._state, twists[:, None], config.interval)
         keypoints, diverged, torn = map(np.asarray, config.outcome(self._engine, self._physics, self._state, after))
         poses = np.asarray(shown.gripper_pose[:, -1])

@@ -44,8 +44,10 @@ def _spaces(config: ShapeCableConfig, render_mode: str | None) -> tuple[gymnasiu
 
 
 def _known(options: dict[str, Any] | None) -> dict[str, Any]:
-    """The options of a reset; raises ValueError if there is another one than `Cables.reset` takes."""
-    options = options or {}
+    """The options of a reset; raises ValueError if they are no dictionary, or not those that `Cables.reset` takes."""
+    options = {} if options is None else options
+    if not isinstance(options, dict):
+        raise ValueError(f"options is of type {type(options).__name__}, expected a dictionary with target or effects.")
     if unknown := set(options) - {"target", "effects"}:
         raise ValueError(f"There is no option {sorted(unknown)[0]!r} of `reset`, expected target or effects.")
     return options

@@ -31,10 +31,10 @@ def check_target(target: Float[Array | np.ndarray, "*batch N 2"]) -> None:
         )
     shape = np.shape(target)
     finite = isinstance(target, Tracer) or bool(np.isfinite(target).all())
-    if len(shape) < 2 or shape[-2] < 3 or shape[-1] != 2 or not finite:
+    fault = " and complex values" if np.iscomplexobj(target) else "" if finite else " with non-finite values"
+    if len(shape) < 2 or shape[-2] < 3 or shape[-1] != 2 or fault:
         raise ValueError(
-            f"The target has shape {shape}{'' if finite else ' with non-finite values'}, "
-            "expected finite keypoints [N, 2] in metres, three or more."
+            f"The target has shape {shape}{fault}, expected finite real keypoints [N, 2] in metres, three or more."
         )
     if not isinstance(target, Tracer) and (same := np.argwhere((np.diff(target, axis=-2) == 0).all(axis=-1))).size:
         first = int(same[0, -1])

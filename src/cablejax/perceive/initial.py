@@ -70,15 +70,15 @@ def padded(points: Float[np.ndarray, "n D"], capacity: int) -> PaddedCloud:
         capacity: rows S of the result, the same for every frame, so that nothing is compiled twice.
 
     Raises:
-        ValueError: the points have another shape or are not numbers.
+        ValueError: the points have another shape or are not real numbers.
     """
     array = np.asarray(points)
     if array.size == 0:
         array = np.zeros((0, 2))
-    if array.ndim != 2 or array.shape[1] not in (2, 3) or not np.issubdtype(array.dtype, np.number):
+    if array.ndim != 2 or array.shape[1] not in (2, 3) or array.dtype.kind not in "iuf":
         raise ValueError(
-            f"A cloud has shape {array.shape} and type {array.dtype}, expected numbers of shape [n, 2] or [n, 3]: one "
-            "row per point, in metres, in the frame of the grippers."
+            f"A cloud has shape {array.shape} and type {array.dtype}, expected real numbers of shape [n, 2] or [n, 3]: "
+            "one row per point, in metres, in the frame of the grippers."
         )
     # cameras report what they do not see as not finite, or as a number without meaning
     finite = (np.abs(array) <= LIMITS["coordinate"].high).all(axis=1)

@@ -29,6 +29,10 @@ class Tracker:
 
     config: TrackerConfig = TrackerConfig()
 
+    def __post_init__(self):
+        if not isinstance(self.config, TrackerConfig):
+            raise ValueError(f"config is of type {type(self.config).__name__}, expected a TrackerConfig.")
+
     def init(
         self, points: Float[np.ndarray, "n D"], gripper_pose: Float[np.ndarray, "Q 3"]
     ) -> tuple[TrackState, Track]:
