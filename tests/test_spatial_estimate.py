@@ -285,6 +285,14 @@ def test_names_only_what_the_estimate_shows(found, everything):
     for stayed in ((), _FOUND, found.tried[:-1]):
         named = named_effects(dataclasses.replace(found, effects=stayed), 0.05)
         assert [effect.name for effect in named] == list(_FOUND)
+    # of one whose bends are shorter than an edge: only what stayed in the search
+    soft = everything.shared.copy()
+    soft[everything.layout.slices["ratio"]] *= 1e-3
+    chain = _at(found, soft)
+    assert found.resolved and not chain.resolved
+    for stayed in ((), _FOUND[1:]):
+        named = named_effects(dataclasses.replace(chain, effects=stayed), 0.05)
+        assert [effect.name for effect in named] == list(stayed)
     # an estimate of a softer middle that is held on both sides
     values, where = everything.shared.copy(), everything.layout.slices["log_profile"]
     values[where] += [0.0, 0.0, 1.5, 0.0, 0.0]

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from cablejax.cable import GRAVITY
 from cablejax.diagnose.judgement import listed
 from cablejax.spatial.cable import GOOD_FIT
 from cablejax.spatial.effects import GRIP
 from cablejax.spatial.gap import OWN
-from cablejax.spatial.identify import EDGES, Identified
+from cablejax.spatial.identify import Identified
 from cablejax.spatial.windows import Windows
 
 STIFF = 3.0
@@ -107,10 +106,12 @@ def _on_fits(windows: Windows, found: Identified) -> list[str]:
         )
     elif groups < 6:
         result.append(f"There are only {groups} recordings: intervals over recordings are rough.")
-    bends, length = (found.everything.stiffness.value / GRAVITY) ** (1 / 3), windows.arclength[-1]
-    why = absent = ""
-    if bends < length / EDGES:
-        absent = ", and one of these that is named may not be there"
+    bends, length, why, absent = found.bends_over, windows.arclength[-1], "", ""
+    if not found.resolved:
+        absent = (
+            ", and an effect that is named may not be there. Effects that do not help to simulate other recordings are "
+            "not named, whatever their values"
+        )
         why = "less than an edge of the simulated cable, so its bending hardly shows"
     elif bends > length / STIFF:
         why = (

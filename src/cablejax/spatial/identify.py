@@ -21,6 +21,7 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from cablejax.cable import GRAVITY
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.accidents import moderated
@@ -92,6 +93,16 @@ class Identified:
     everything: Estimate
     halves: tuple[Estimate, Estimate]
     first: Bool[np.ndarray, "W"]
+
+    @property
+    def bends_over(self) -> float:
+        """Length over which the cable bends under its own weight, (EI / (rho g))^(1/3), by its estimate [m]."""
+        return float((self.everything.stiffness.value / GRAVITY) ** (1 / 3))
+
+    @property
+    def resolved(self) -> bool:
+        """Whether that is more than an edge of the simulated cable, which hangs like a chain otherwise."""
+        return self.bends_over >= self.cable.windows.arclength[-1] / EDGES
 
     def unseen(
         self, effects: Collection[str] | None = None

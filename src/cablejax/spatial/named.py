@@ -43,7 +43,9 @@ _TELLING = {
 def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
     """The effects that the estimate shows, with parameters and 90 % intervals: those that stayed in the search first.
 
-    That an effect does not help to simulate other recordings, which the search asks, does not mean that it is absent.
+    That an effect does not help to simulate other recordings, which the search asks, does not mean that it is absent:
+    it is named all the same, but not of a cable whose bends the simulator does not resolve. There, intervals are too
+    narrow for their absence to count alone.
 
     Args:
         found: by `identify`.
@@ -56,7 +58,7 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
     wider = float(t.ppf(0.5 + 0.5 * SURE, estimate.freedom) / t.ppf(REPORTED, estimate.freedom))
     # motion shows the drags' sum: it goes by the names that stayed in the search, or by that of the larger one
     drags = [name for name in found.effects if name in _DRAGS] or [_main_drag(estimate)]
-    for name in dict.fromkeys((*found.effects, *found.tried)):
+    for name in dict.fromkeys((*found.effects, *(found.tried if found.resolved else ()))):
         if name in _DRAGS and name not in drags:
             continue
         parameters, along = parameters_of(
