@@ -101,9 +101,9 @@ def test_the_referee_of_the_soak_sees_what_goes_wrong(tmp_path, monkeypatch):
     broken = dataclasses.replace(robot_soak.LINK, watchdog=30.0, grace=30.0, limits=None)
     add = robot_soak.RobotRun.exchange
 
-    def forgetful(self, at, observations=()):
+    def forgetful(self, at, observations=(), clock=None):
         newest = self._state.newest
-        return add(self, at, [o for o in observations if newest is None or o.time > newest.time])
+        return add(self, at, [o for o in observations if newest is None or o.time > newest.time], clock)
 
     monkeypatch.setattr(robot_soak.RobotRun, "exchange", forgetful)
     monkeypatch.setattr(robot_soak, "RobotLink", lambda controller, target, _: RobotLink(controller, target, broken))
@@ -222,7 +222,8 @@ server.serve(run_to(pathlib.Path(sys.argv[1])), port=0, ready=lambda port: print
 """
 
 
-def test_ctrl_c_ends_the_server_and_keeps_the_log(tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, -signal.SIGINT), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_server_and_keeps_the_log(tmp_path, number, code):
     tests = str(pathlib.Path(__file__).parent)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, tests])}
     process = subprocess.Popen(
@@ -236,13 +237,13 @@ def test_ctrl_c_ends_the_server_and_keeps_the_log(tmp_path):
             for k in range(3):
                 robot.sendall(robot_soak.observation_line(harness.seen(0.1 * k)))
                 assert json.loads(lines.readline())["status"] == "resting"
-            process.send_signal(signal.SIGINT)
+            process.send_signal(number)
             process.wait(timeout=60)
     finally:
         process.kill()
         process.wait()
         process.stdout.close()
-    assert process.returncode == -signal.SIGINT, "the interrupt goes on to whoever started the server"
+    assert process.returncode == code, "the interrupt goes on to whoever started the server"
     assert read_gap_log(tmp_path / "log.npz").episode_length.tolist() == [3]
 
 
@@ -521,7 +522,7 @@ class Failing(Inwards):
         return super().step(state, measurement)
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, RuntimeError])
 def test_a_ros_node_that_is_interrupted_stops_the_arms_and_keeps_the_log(tmp_path, ros, error):
     run = RobotRun(RobotLink(Failing(), TARGET, LinkConfig()), CABLE, tmp_path / "log.npz")
     harness, nodes, before = Harness(), [], []
@@ -535,6 +536,8 @@ def test_a_ros_node_that_is_interrupted_stops_the_arms_and_keeps_the_log(tmp_pat
             node.callbacks["~/keypoints"](pose_array(node.now, seen.keypoints))
             if k == 35 and error is KeyboardInterrupt:
                 raise KeyboardInterrupt
+            if k == 35 and error is SystemExit:
+                signal.raise_signal(signal.SIGTERM)
             node.timers[0][1]()
             before[:] = [node.sent()]
 

@@ -117,6 +117,23 @@ def interrupt_flag() -> Iterator[threading.Event]:
 
 
 @contextlib.contextmanager
+def ended_by_sigterm() -> Iterator[None]:
+    """SIGTERM leaves the block by SystemExit, as Ctrl-C leaves it by KeyboardInterrupt, so that it ends in order."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def leave(number, frame):
+        raise SystemExit(128 + number)  # as shells have it
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
 def saving() -> Iterator[None]:
     """Gives the block `SAVING` seconds after Ctrl-C."""
     _saving.set()

@@ -28,8 +28,8 @@ def spin(run: RobotRun, *, name: str = "cablejax", frame: str = "world") -> path
     keypoints is one observation, with its own time stamp and the poses nearest to it, if they are less than one tick
     older or newer; it waits a tick for them, since topics come in any order. It publishes `~/gripper_0/twist` and
     `~/gripper_1/twist` (geometry_msgs/TwistStamped) at 20 Hz, zero when a command has ended and at last, also after
-    Ctrl-C and errors, and `~/status` (std_msgs/String). The controller computes between two ticks, so arms need a
-    timeout of their own.
+    Ctrl-C, SIGTERM and errors, and `~/status` (std_msgs/String). The controller computes between two ticks, so arms
+    need a timeout of their own.
 
     Args:
         run: the run.
@@ -37,7 +37,7 @@ def spin(run: RobotRun, *, name: str = "cablejax", frame: str = "world") -> path
         frame: of all messages; others are refused.
 
     Returns:
-        The path of the log, which is also written after Ctrl-C and after an error.
+        The path of the log, which is also written after Ctrl-C, SIGTERM and errors.
 
     Raises:
         GapLogError: nothing usable was observed.

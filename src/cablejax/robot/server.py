@@ -46,7 +46,7 @@ def serve(
         ready: called with the port once robots can connect.
 
     Returns:
-        The path of the log, which is also written after Ctrl-C and after an error.
+        The path of the log, which is also written after Ctrl-C, SIGTERM and errors.
 
     Raises:
         OSError: the address is taken.

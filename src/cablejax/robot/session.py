@@ -16,6 +16,7 @@ from cablejax.control.link_state import Reply, Status
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.run_log import RunLog, motion
 from cablejax.gaplog import GapLogError, write_gap_log
+from cablejax.interrupts import ended_by_sigterm
 from cablejax.log_setup import setup_fault
 from cablejax.simulate.table_plant import Observation
 from cablejax.types import GapLog
@@ -81,9 +82,10 @@ class RobotRun:
         return self.exchange(now)
 
     def recorded(self, drive: Callable[[], None]) -> pathlib.Path:
-        """Calls what drives the run to its end, and writes the log: see `finish`. After Ctrl-C and errors as well."""
+        """Calls what drives the run to its end, and writes the log, see `finish`; after signals and errors as well."""
         try:
-            drive()
+            with ended_by_sigterm():
+                drive()
         except BaseException:
             # report the error that ended the run, even if there is no log to keep
             with contextlib.suppress(GapLogError):
