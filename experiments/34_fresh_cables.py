@@ -275,8 +275,8 @@ def page(rows: list[dict[str, Any]], every: list[dict[str, Any]], made: str) -> 
         "samples and markers); where it is hidden, motion does not show it, as the bending of a long, soft cable that "
         "hangs like a chain. Named is what a diagnosis would say: effects whose values show them, if the named ones "
         "together lessen the error on recordings that no fit has seen, beyond chance; of a cable that bends over less "
-        "than an edge of the fitted rod only those that the search kept as well. Naming no effect would find none in the first column, and be right in all cases of the "
-        "last. Either law of drag counts for both. The markers' mass and places are not judged: motion hardly "
+        "than an edge of the fitted rod only those that the search kept as well. Naming no effect would find none in the "
+        "first column, and be right in all cases of the last. Either law of drag counts for both. The markers' mass and places are not judged: motion hardly "
         "separates the markers' mass from the cable's own, and their places are read off the recording with errors of "
         "some millimetres.",
         "",
@@ -294,7 +294,7 @@ def page(rows: list[dict[str, Any]], every: list[dict[str, Any]], made: str) -> 
         "speed of every cable, and the parameters of effects that are named and there. All intervals are wider than "
         "jackknife, priors and edges give, by `UNMODELLED`, which was calibrated on 120 cables of 0.85 to 1 m with "
         "EI/rho of 0.009 to 0.2 m^4/s^2; `--calibrate` prints it from these and six of the wider range. The threshold "
-        "for naming was chosen on 40 of them, and the rule for cables that hang like chains on nine others.",
+        "for naming was chosen on 40 of them, and the rule for cables that hang like chains on ten others.",
         "",
         *interval_table(rows),
         "",
