@@ -275,9 +275,10 @@ def page(rows: list[dict[str, Any]], every: list[dict[str, Any]], made: str) -> 
         "samples and markers); where it is hidden, motion does not show it, as the bending of a long, soft cable that "
         "hangs like a chain. Named is what a diagnosis would say: effects whose values show them, if the named ones "
         "together lessen the error on recordings that no fit has seen, beyond chance; of a cable that bends over less "
-        "than an edge of the fitted rod only those that the search kept as well. Naming no effect would find none in the "
-        "first column, and be right in all cases of the last. Either law of drag counts for both. The markers' mass and places are not judged: motion hardly "
-        "separates the markers' mass from the cable's own, and their places are read off the recording with errors of "
+        "than an edge of the fitted rod only those that the search kept as well. Naming no effect would find none in "
+        "the first column, and be right in all cases of the last. Either law of drag counts for both. The markers' "
+        "mass and places are not judged: motion hardly separates the markers' mass from the cable's own, and their "
+        "places are read off the recording with errors of "
         "some millimetres.",
         "",
         *named_table(rows),
