@@ -1,10 +1,12 @@
 """The accelerator's benchmark: what it measures, keeps and writes, at a small size on the processor."""
 
+import dataclasses
 import json
 import pathlib
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
@@ -17,6 +19,8 @@ from accelerator_sections import ENGINES, SECTIONS, Sizes
 from energy import EnergyMeter
 
 from cablejax.cable import Discretisation
+from cablejax.dynamics.graph import build_graph, prior_of
+from dynamics_cases import SMALL, arched_history
 
 
 @pytest.fixture
@@ -92,6 +96,18 @@ def test_an_engine_asks_for_full_precision(name):
     ]
     highest = jax.lax.Precision.HIGHEST
     assert products and {equation.params["precision"] for equation in products} == {(highest, highest)}
+
+
+def test_what_a_network_sees_is_computed_in_full_precision():
+    config = dataclasses.replace(SMALL, prior="static")
+
+    def seen(history, twist):
+        return build_graph(history, twist, prior_of(history, twist, config), config).nodes
+
+    program = jax.make_jaxpr(seen)(arched_history(config), jnp.zeros((2, 3)))
+    products = [one for one in equations(program.jaxpr) if one.primitive.name == "dot_general"]
+    highest = jax.lax.Precision.HIGHEST
+    assert len(products) > 5 and {one.params["precision"] for one in products} == {(highest, highest)}
 
 
 def equations(jaxpr):

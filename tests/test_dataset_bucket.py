@@ -121,7 +121,7 @@ def wire(server, monkeypatch):
     one.place.close()
 
 
-def test_a_bucket_holds_what_a_folder_holds(wire, tmp_path):
+def test_a_bucket_holds_what_a_folder_holds(wire, tmp_path, monkeypatch):
     local = generate(TINY, tmp_path / "data.zarr", progress=False)
     shares = [generate(TINY, "s3://cables/data.zarr", process_index=k, process_count=2, progress=False) for k in (0, 1)]
     assert not shares[0].complete and shares[1].complete and shares[1].digest == local.digest
@@ -132,6 +132,11 @@ def test_a_bucket_holds_what_a_folder_holds(wire, tmp_path):
         open_or_create("s3://cables/data.zarr", dataclasses.replace(TINY, seed=6))
     with pytest.raises(ValueError, match=r"s3://cables/none holds no data set"):
         open_store("s3://cables/none")
+    # another process is done just after this one has looked
+    read, looks = Bucket.read, iter([None])
+    monkeypatch.setattr(Bucket, "read", lambda self, name: next(looks, read(self, name)))
+    assert open_or_create("s3://cables/data.zarr", TINY).info().complete
+    monkeypatch.setattr(Bucket, "read", read)
     Bucket("s3://cables/other").write("letter.txt", b"hello")
     with pytest.raises(ValueError, match="holds objects, but no data set"):
         open_or_create("s3://cables/other", TINY)

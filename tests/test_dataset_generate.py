@@ -382,16 +382,44 @@ def test_a_trajectory_that_never_works_is_an_error_not_data(tmp_path):
 def test_faults_are_distinguished(reference):
     block = open_store(reference).read()
     one = dataclasses.replace(block, **{f.name: getattr(block, f.name)[0] for f in dataclasses.fields(block)})
-    assert find_fault(TINY, one) is None
+    assert find_fault(TINY, one, ()) is None
 
     def spoil(scale):
         return dataclasses.replace(one, keypoints=one.keypoints * np.float32(scale))
 
-    assert "not finite" in find_fault(TINY, spoil(np.nan))
-    assert "from its gripper" in find_fault(TINY, spoil(1.1))
+    assert "not finite" in find_fault(TINY, spoil(np.nan), ())
+    assert "from its gripper" in find_fault(TINY, spoil(1.1), ())
     middle = one.keypoints.copy()
     middle[:, 1] += np.float32(0.2)
-    assert "stretched" in find_fault(TINY, dataclasses.replace(one, keypoints=middle))
+    assert "stretched" in find_fault(TINY, dataclasses.replace(one, keypoints=middle), ())
+
+
+def test_a_bias_of_keypoints_excuses_its_own_trajectories_alone(monkeypatch):
+    """One draw of a posterior that moves keypoints must not let all others off."""
+    bias = GivenEffect("keypoint_bias", VALUES["keypoint_bias"])
+    config, asked = dataclasses.replace(TINY, posterior=((bias,), ())), {}
+
+    def noted(config, one, effects):
+        asked[len(asked)] = effects
+        return find_fault(config, one, effects)
+
+    monkeypatch.setattr(generation, "find_fault", noted)
+    simulate(config, make_engine(config), [0])
+    assert list(asked.values()) == [config.effects_of(row) for row in config.shard_rows(0)]
+    assert {len(effects) for effects in asked.values()} == {0, 1}
+
+
+def test_a_damaged_shard_is_not_made_again_by_other_packages(reference, tmp_path):
+    path = tmp_path / "data"
+    shutil.copytree(reference, path)
+    meta = json.loads((path / "zarr.json").read_text())
+    meta["attributes"]["versions"]["mujoco"] = "0.0.1"
+    (path / "zarr.json").write_text(json.dumps(meta))
+    assert generate(TINY, path, progress=False).complete
+    victim = next(file for file in (path / "keypoints" / "c" / "1").rglob("*") if file.is_file())
+    victim.write_bytes(victim.read_bytes()[:-7])
+    with pytest.raises(ValueError, match=r"begun with other packages: mujoco is '0\.0\.1' in the store"):
+        generate(TINY, path, progress=False)
 
 
 def test_ends_off_the_grippers_are_a_fault_of_small_cables_too():
@@ -402,9 +430,9 @@ def test_ends_off_the_grippers_are_a_fault_of_small_cables_too():
     points[..., 0] = 0.9 * cable.keypoint_arclength
     pose = np.concatenate([points[:, [0, -1]], np.zeros((2, 2, 1), np.float32)], axis=-1)
     one = Block(points, pose, np.zeros((1, 2, 3), np.float32), np.ones(3), np.zeros((), np.int32))
-    assert find_fault(config, one) is None
+    assert find_fault(config, one, ()) is None
     beside = dataclasses.replace(one, keypoints=points + np.float32([0.0, 0.009]))
-    assert "m from its gripper (allowed: 0.0005 m)" in (find_fault(config, beside) or "")
+    assert "m from its gripper (allowed: 0.0005 m)" in (find_fault(config, beside, ()) or "")
 
 
 @pytest.mark.slow

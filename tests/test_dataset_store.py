@@ -8,6 +8,7 @@ import os
 import shutil
 import tempfile
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -257,6 +258,22 @@ def test_versions_are_not_mixed(tmp_path):
         open_or_create(path, SMALL)
     complete(store)
     assert open_or_create(path, SMALL).info().complete  # nothing is left to be mixed
+
+
+@pytest.mark.parametrize("mounted", [False, True])
+def test_an_empty_folder_that_is_a_link_or_mounted_is_filled(tmp_path, monkeypatch, mounted):
+    """Nothing can be renamed to where another file system is mounted."""
+    disk, path = tmp_path / "disk", tmp_path / "data"
+    disk.mkdir()
+    path.symlink_to(disk)
+    if mounted:
+        monkeypatch.setattr(Path, "rename", Mock(side_effect=OSError(errno.EBUSY, "Device or resource busy")))
+    store = open_or_create(path, SMALL)
+    monkeypatch.undo()
+    complete(store)
+    complete(open_or_create(tmp_path / "other", SMALL))
+    assert path.is_symlink() and tree(disk) == tree(tmp_path / "other")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["data", "disk", "other"]
 
 
 def test_altered_or_damaged_configuration_is_noticed(tmp_path):

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose import explanation
+from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.evidence import repeated_motions, share_of_motion
 from cablejax.diagnose.fit import evaluate, improve
+from cablejax.diagnose.gap import held_out_predictions, measure_gap
 from cablejax.diagnose.posterior import QUANTILE, profile_widths
+from cablejax.diagnose.run import weighed
 from diagnose_cases import evidence, parts
 
 
@@ -23,7 +26,9 @@ def test_motions_a_twentieth_of_the_length_apart_are_one():
     assert repeated_motions(pose, np.full(4, 0.1), 1.0).tolist() == [0, 0, 2, 0]
     # seen on a shorter cable they differ
     assert repeated_motions(pose, np.full(4, 0.1), 0.5).tolist() == [0, 1, 2, 0]
-    np.testing.assert_allclose(share_of_motion(np.array([0, 0, 2, 0])), [1 / 3, 1 / 3, 1, 1 / 3])
+    motion, seen = np.array([0, 0, 2, 0]), np.array([True, True, False, False])
+    np.testing.assert_allclose(share_of_motion(motion, np.ones(4, bool)), [1 / 3, 1 / 3, 1, 1 / 3])
+    np.testing.assert_allclose(share_of_motion(motion, seen)[seen], [1 / 2, 1 / 2])
 
 
 def test_an_episode_twice_tells_no_more_than_once():
@@ -34,6 +39,40 @@ def test_an_episode_twice_tells_no_more_than_once():
     assert once.log_likelihoods(one.sse).sum() == pytest.approx(twice.log_likelihoods(two.sse).sum(), rel=1e-6)
     np.testing.assert_allclose(one.precision(once), two.precision(twice), rtol=1e-4)
     np.testing.assert_allclose(one.held_out_sse(once), two.held_out_sse(twice)[:4], rtol=1e-4)
+
+
+def test_a_repetition_that_nobody_saw_has_no_say():
+    """The camera was off in it."""
+    once = evidence(("bending_stiffness", (1.4,)))
+    twice = dataclasses.replace(once.restricted([0, 1, 2, 3, 0]), motion=np.array([0, 1, 2, 3, 0]))
+    twice.observed[4] = np.nan
+    trial = explanation(*parts(("bending_stiffness", (1.3,))))
+    one, two = evaluate(once, [trial])[0], evaluate(twice, [trial])[0]
+    assert one.cost(once) == pytest.approx(two.cost(twice), rel=1e-6)
+    assert once.log_likelihoods(one.sse).sum() == pytest.approx(twice.log_likelihoods(two.sse).sum(), rel=1e-6)
+    np.testing.assert_allclose(one.precision(once), two.precision(twice), rtol=1e-4)
+
+
+def test_a_motion_that_nobody_saw_is_none_that_can_be_held_out():
+    facts = evidence(("bending_stiffness", (1.4,)))
+    observed, motion = facts.observed.copy(), np.array([0, 0, 0, 3])
+    observed[3] = np.nan
+    seen = weighed(facts.simulator, observed, facts.nominal, facts.noise, motion, Calibration())
+    (best,) = evaluate(seen, [explanation(*parts(("bending_stiffness", (1.3,))))])
+    predicted, held_out = held_out_predictions(seen, best)
+    assert held_out == ()
+    time = {"interval": np.full(4, 0.1), "length": np.full(4, observed.shape[1])}
+    gap = measure_gap(seen, facts.nominal, predicted, **time, held_out=(0, 1, 2), resolvable=True)
+    without = measure_gap(
+        seen.restricted([0, 1, 2]),
+        facts.nominal[:3],
+        predicted[:3],
+        **{name: values[:3] for name, values in time.items()},
+        held_out=(0, 1, 2),
+        resolvable=True,
+    )
+    assert gap.shrinkage == pytest.approx(without.shrinkage) and gap.shrinkage > 0.5
+    assert gap.shrinkage_ci90 == pytest.approx(without.shrinkage_ci90)
 
 
 def test_profiles_of_a_nearly_linear_fit_are_those_of_its_covariance():

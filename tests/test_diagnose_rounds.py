@@ -32,7 +32,7 @@ def _rounds(evidence: Evidence) -> tuple[Rounds, np.ndarray]:
     starts = [explanation(*parts(one)) for one in (SOFT, RUBBED)]
     fits = improve(evidence, evaluate(evidence, [explanation(), *starts]), 12)
     found = Search.of(fits, evidence, CALIBRATION)
-    log = log_of(np.nan_to_num(evidence.observed))
+    log = log_of(evidence.observed)
     log = dataclasses.replace(
         log, meta={**log.meta, "recordings": [{"name": "a", "episodes": 2}, {"name": "b", "episodes": 2}]}
     )
@@ -71,6 +71,15 @@ def test_one_set_up_does_not_contradict_itself(alike):
     rounds, _ = alike
     assert next(iter(rounds.rounds[0].nats)) == "bending_stiffness"
     assert not rounds.contradictory
+
+
+def test_a_recording_that_shows_nothing_gains_nothing_of_its_own():
+    """Its prior alone would rather have no effect."""
+    facts = _mixed(SOFT, SOFT)
+    facts.observed[2:] = np.nan
+    rounds, _ = _rounds(facts)
+    assert [one.own_gain for one in rounds.rounds] == pytest.approx([0.0, 0.0], abs=0.05)
+    assert rounds.contradiction > 0.5
 
 
 def test_a_cable_that_was_changed_between_two_recordings():

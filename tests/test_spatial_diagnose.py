@@ -22,11 +22,12 @@ from cablejax.simulate.rod import Rod
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock, thinned, with_poses_in_time
-from cablejax.spatial.diagnose import _equivalent, _ranking, diagnose_space
+from cablejax.spatial.diagnose import _ranking, diagnose_space
 from cablejax.spatial.estimate import Estimate
 from cablejax.spatial.gap import OWN, in_log, is_gap, own_error, smallest_gap, where_of, with_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import TWISTED, Identified, _searched, _twisted, layout_of
+from cablejax.spatial.judge import _equivalent
 from cablejax.spatial.named import _damped
 from cablejax.spatial.search import Step, falls, halves
 from cablejax.spatial.windows import windows_of

@@ -40,7 +40,7 @@ class StraightDrive:
 
     def step(self, state: tuple[()], measurement: Measurement) -> tuple[tuple[()], Float[Array, "2 3"], None]:
         """The twist [m/s, rad/s] that goes straight on."""
-        return state, _drive(self.config, jnp.asarray(self.target), *map(jnp.asarray, measurement)), None
+        return state, _drive(self.config, jnp.asarray(self.target), *map(jnp.asarray, measurement[:2])), None
 
 
 @functools.partial(jax.jit, static_argnums=0)

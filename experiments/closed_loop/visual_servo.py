@@ -230,7 +230,7 @@ def _observe(
 
     The motion is that of the measured poses, which a robot may reach only in part.
     """
-    (keypoints, gripper_pose), dtype = map(jnp.asarray, measurement), state.keypoints.dtype
+    (keypoints, gripper_pose), dtype = map(jnp.asarray, measurement[:2]), state.keypoints.dtype
     expected = state.keypoints + state.jacobian @ state.motion.reshape(-1)
     observed = jnp.isfinite(keypoints).all(axis=-1)
     keypoints = jnp.where(observed[:, None], keypoints, expected).astype(dtype)

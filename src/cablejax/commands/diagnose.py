@@ -143,6 +143,7 @@ def diagnose_and_report(
         from cablejax.spatial.diagnose import diagnose_space
 
         spatial = diagnose_space(log, only=only or None, state=state, progress=say)
+        write_motion(folder, None, log)  # that of an earlier diagnosis goes
         return spatial, write_diagnosis_page(spatial, folder)
     result = diagnose(
         log,

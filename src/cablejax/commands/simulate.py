@@ -190,5 +190,6 @@ def _clear(place: pathlib.Path | Bucket, config: DatasetConfig) -> None:
             with sole_writer(writer):
                 pass
         # whole or not at all: what is left without its head is no data set
+        place = place.resolve()  # not a link to it
         with draft_folder(place) as old:
             place.rename(old)

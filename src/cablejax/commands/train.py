@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 import pathlib
+import shlex
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from cablejax.commands.options import Command, UsageError, say, text_table
@@ -76,12 +77,17 @@ class Train(Command):
         from cablejax.dynamics.fine_tune import starting_from
         from cablejax.dynamics.parallel import training_mesh
         from cablejax.dynamics.train import train
-        from cablejax.dynamics.weights import FILE_NAME, save_weights
+        from cablejax.dynamics.weights import FILE_NAME, save_weights, weights_path
 
         if self.steps is not None:
             require(self.steps, "optimiser_steps", "--steps", "Leave it out for those of the preset.")
         if self.lr is not None:
             require(self.lr, "learning_rate", "--lr")
+        if self.start_from is not None and weights_path(self.start_from).resolve().is_relative_to(self.out.resolve()):
+            raise UsageError(
+                f"--start-from {self.start_from} lies in {self.out}, where the training writes its own weights. Name "
+                "another folder with --out."
+            )
         stores = [open_store(path) for path in self.data]
         self._check_cables(stores)
         asymmetric = sorted({name for store in stores for name in store.config.asymmetric})
@@ -209,8 +215,6 @@ class Train(Command):
         from cablejax.dataset.schema import config_to_json
         from cablejax.provenance import machine, versions
 
-        stems = [store.path.name.removesuffix(".zarr") for store in stores]
-        names = [stem if stems.count(stem) == 1 else f"{stem} {k + 1}" for k, stem in enumerate(stems)]
         training = json.loads(json.dumps(dataclasses.asdict(config)))
         del training["model"]  # the weights file has it, with the normalisation
         return {
@@ -226,7 +230,7 @@ class Train(Command):
                     "versions": store.versions,
                     "held_out": count,
                 }
-                for name, store, count in zip(names, stores, held_out, strict=True)
+                for name, store, count in zip(_names(stores), stores, held_out, strict=True)
             ],
             "training": training,
             "versions": versions(),
@@ -238,20 +242,34 @@ class Train(Command):
         from cablejax.commands.reproduce import command_line, simulate_command
         from cablejax.dynamics.card import write_card
 
+        name = self.out.resolve().name
+        ends = [".zarr" if store.path.name.endswith(".zarr") else "" for store in stores]
+        data = [f"{stem}{end}" for stem, end in zip(_names(stores), ends, strict=True)]
+        training = dataclasses.replace(self, data=tuple(map(pathlib.Path, data)))
         write_card(
             self.out / "card.md",
-            name=self.out.name,
+            name=name,
             config=model,
             info=info,
             metrics=self.out / "metrics.csv",
             report=report,
             commands=[
                 *(
-                    [f"cablejax cable --from {self.out.name} --out cable.toml"]
+                    [shlex.join(["cablejax", "cable", "--from", name, "--out", "cable.toml"])]
                     if stores[0].config.cable != Cable()
                     else []
                 ),
-                *(simulate_command(store.config, store.path.name) for store in stores),
-                command_line(self, "train"),
+                *(simulate_command(store.config, place) for store, place in zip(stores, data, strict=True)),
+                command_line(training, "train"),
             ],
         )
+
+
+def _names(stores: list[Store]) -> list[str]:
+    """Of the data sets: the last part of each place, with a number where two have the same."""
+    stems = [store.path.name.removesuffix(".zarr") for store in stores]
+    names: list[str] = []
+    for stem in stems:
+        numbered = (name for k in itertools.count(1) if (name := f"{stem} {k}") not in (*stems, *names))
+        names.append(stem if stems.count(stem) == 1 else next(numbered))
+    return names

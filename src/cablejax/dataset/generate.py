@@ -22,11 +22,11 @@ from tqdm import tqdm
 from cablejax.cores import available_cores
 from cablejax.dataset.bucket import Bucket
 from cablejax.dataset.drawing import Draw, cable_params, draw_all
-from cablejax.dataset.opening import open_or_create
+from cablejax.dataset.opening import open_or_create, require_same_versions
 from cablejax.dataset.parallel import DeviceParallel
 from cablejax.dataset.schema import Block, DatasetConfig
 from cablejax.dataset.store import DatasetInfo, Store
-from cablejax.effects.given import EFFECTS
+from cablejax.effects.given import EFFECTS, GivenEffect
 from cablejax.simulate import ENGINES, Engine, ThreadedEngine
 from cablejax.types import Trajectory
 from cablejax.whole_file import sole_writer
@@ -106,6 +106,7 @@ def generate(
 
         def lacking(shard: int) -> bool:
             if store.status(shard) != "complete":
+                require_same_versions(store)  # also where one shard of a complete store is damaged
                 return True
             done.append(shard)
             if progress:
@@ -209,7 +210,8 @@ def simulate(
             out["gripper_twist"][part] = [item.gripper_twist for item in draws]
             out["parameters"][part] = [item.parameters for item in draws]
             out["attempts"][part] = attempt
-            faults = {k: find_fault(config, Block(**{n: a[k] for n, a in out.items()})) for k in part}
+            blocks = ((k, Block(**{n: a[k] for n, a in out.items()})) for k in part)
+            faults = {k: find_fault(config, one, config.effects_of(int(rows[k]))) for k, one in blocks}
             problems |= {k: fault for k, fault in faults.items() if fault}
             progress(len(part) - sum(fault is not None for fault in faults.values()))
         pending = np.array(sorted(problems), dtype=int)
@@ -226,8 +228,8 @@ def simulate(
     )
 
 
-def find_fault(config: DatasetConfig, one: Block) -> str | None:
-    """Why one trajectory (a `Block` without its first axis) cannot be real, or None if it can.
+def find_fault(config: DatasetConfig, one: Block, effects: Sequence[GivenEffect]) -> str | None:
+    """Why one trajectory (a `Block` without its first axis) of a cable with these effects cannot be real, or None.
 
     Effects of the observation move keypoints off the grippers, and they and those of the extension stretch the cable:
     with them, that is no fault.
@@ -235,7 +237,7 @@ def find_fault(config: DatasetConfig, one: Block) -> str | None:
     keypoints, grippers = one.keypoints, one.gripper_pose[..., :2]
     if not (np.isfinite(keypoints).all() and np.isfinite(one.gripper_pose).all()):
         return "the simulation diverged (not finite)"
-    hooks = {EFFECTS[name].hook for name in config.effect_names}
+    hooks = {EFFECTS[effect.name].hook for effect in effects}
     if "observation" in hooks:
         return None
     gap = np.linalg.norm(keypoints[:, [0, -1]] - grippers, axis=-1).max()

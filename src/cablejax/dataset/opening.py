@@ -146,12 +146,8 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
             f"{place} holds a data set of another configuration: {changes}. Give another folder, or the configuration "
             "with which it was begun. Nothing was changed."
         )
-    changes = _changes(store.versions, versions)
-    if changes and not store.info().complete:
-        raise ValueError(
-            f"{place} was begun with other packages: {changes}. Trajectories of different versions cannot be mixed: "
-            "install those versions, or generate in another folder. Nothing was changed."
-        )
+    if not store.info().complete:
+        require_same_versions(store)
     faulty = [f"{name}/zarr.json" for name in _arrays(config) if _fault(store, name)]
     descriptions = _descriptions(config, versions) if faulty else {}
     for name in faulty:  # the trajectories stay: each is checked against its digest
@@ -164,21 +160,42 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
     return recorded_store(place, "r+") if faulty else store
 
 
+def require_same_versions(store: Store) -> None:
+    """Raises ValueError if the data set was begun with other packages, whose trajectories cannot be mixed with ours."""
+    if changes := _changes(store.versions, package_versions(PACKAGES)):
+        raise ValueError(
+            f"{store.path} was begun with other packages: {changes}. Trajectories of different versions cannot be "
+            "mixed: install those versions, or generate in another folder. Nothing was changed."
+        )
+
+
 def _changes(stored: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     found = differences(stored, asked).items()
     return "; ".join(f"{name} is {old!r} in the store and {new!r} here" for name, (old, new) in found)
 
 
 def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None:
-    """Makes the empty store under a temporary name and renames it: it appears whole, and only once."""
+    """Makes the empty store under a temporary name and renames it: it appears whole, and only once.
+
+    Into an empty folder that cannot be renamed, as a mounted one, its own description is written last.
+    """
+    path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
     with draft_folder(path) as draft:
         _fill(draft, config, versions)
         try:
             draft.rename(path)
-        except OSError:  # another process was first
-            if not (path / "zarr.json").is_file():
+        except OSError:
+            if (path / "zarr.json").is_file():  # another process was first
+                return
+            if not path.is_dir() or any(path.iterdir()):
                 raise
+            files = sorted(draft.rglob("zarr.json"), key=lambda file: file.parent == draft)
+            for file in files:
+                place = path / file.relative_to(draft)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                with whole_file(place) as stream:
+                    stream.write(file.read_bytes())
 
 
 def _create_in_bucket(bucket: Bucket, config: DatasetConfig, versions: dict[str, str]) -> None:
@@ -188,7 +205,10 @@ def _create_in_bucket(bucket: Bucket, config: DatasetConfig, versions: dict[str,
     """
     if bucket.read("zarr.json") is not None:
         return
-    if any(not name.endswith("/zarr.json") for name in bucket.names()):
+    names = bucket.names()
+    if "zarr.json" in names:  # another process was first
+        return
+    if any(not name.endswith("/zarr.json") for name in names):
         raise ValueError(f"{bucket} holds objects, but no data set. Give a new prefix; nothing was changed.")
     descriptions = _descriptions(config, versions)
     for name in sorted(descriptions, key=lambda name: name == "zarr.json"):

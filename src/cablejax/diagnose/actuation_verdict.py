@@ -13,7 +13,7 @@ from cablejax.diagnose.actuation import NEGLIGIBLE, Actuation
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import PLACES, EffectValues, NamedEffect, Ranked, Verdict
-from cablejax.diagnose.evidence import student_log_likelihoods
+from cablejax.diagnose.evidence import share_of_motion, student_log_likelihoods
 from cablejax.diagnose.posterior import POSTERIOR, QUANTILE
 from cablejax.effects.given import EFFECTS
 
@@ -59,6 +59,7 @@ def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration,
         posterior=tuple(map(operator.add, _drawn(arms, len(of_cable)), of_cable)) if named else conclusion.posterior,
         ranking=tuple(sorted([*ranked, *conclusion.ranking], key=lambda r: -(r.probability or 0.0))),
         explained=share if conclusion.verdict == "none" else conclusion.explained,
+        undecided=conclusion.undecided and not named,
     )
 
 
@@ -93,9 +94,10 @@ def _scores(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...], 
     """
     calibration = dataclasses.replace(calibration, baseline=NEGLIGIBLE)
     temper = calibration.temper(arms.unseen[()], arms.noise, arms.count)
+    share = share_of_motion(arms.motion, arms.count > 0)
     return {
         effects: student_log_likelihoods(
-            arms.count * ((error / arms.noise) ** 2 - 1.0) / temper, calibration.freedom, arms.motion
+            arms.count * ((error / arms.noise) ** 2 - 1.0) / temper, calibration.freedom, share
         ).sum()
         - calibration.term_cost * len(effects)
         for effects, error in arms.unseen.items()

@@ -92,7 +92,10 @@ class Case:
             DiagnosisError: the log cannot be diagnosed; the message says why and what to do.
         """
         recording = prepare(log)
-        noise = noise_floor(recording.keypoints, recording.hold)
+        try:
+            noise = noise_floor(recording.keypoints, recording.hold)
+        except ValueError as error:
+            raise DiagnosisError(str(error)) from error
         arms = actuation(
             recording.gripper_pose,
             recording.gripper_command if recording.has_commands else None,
@@ -132,6 +135,7 @@ class Case:
             raise DiagnosisError(
                 "The nominal simulation of this log diverges: are the poses continuous, and in metres?"
             )
+        seen = np.isfinite(recording.keypoints).any(axis=(1, 2, 3))
         # roughly [m]: the world's origin wherever the grippers are within a length of the cable of it
         frame = _FRAME * config.cable.length
         place = frame * np.round(np.nanmean(recording.gripper_pose[..., :2], axis=(0, 1, 2)) / frame)
@@ -139,7 +143,7 @@ class Case:
             effects=[effect.sized(config.cable.length).around(place) for effect in effects],
             playback=playback,
             correction=nominal - run(playback),
-            duration=float((recording.interval * recording.length).min()),
+            duration=float((recording.interval * recording.length)[seen].min()),
             max_curvature=largest_curvature(nominal, marks).max(axis=1),
         )
         moved = arms.deviates

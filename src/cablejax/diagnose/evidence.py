@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from cablejax.arrays import positions_at
 from cablejax.diagnose.protocol import Explanation, Simulator
@@ -98,12 +98,17 @@ class Evidence:
 
     def log_likelihoods(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
         """Log likelihood of each episode, see `student_log_likelihoods`."""
-        return student_log_likelihoods(self.surprise(sse), self.freedom, self.motion)
+        return student_log_likelihoods(self.surprise(sse), self.freedom, self.share)
 
     def weight(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
         """Weight of each episode's squared residuals in the least squares problem that a fit solves in one step."""
-        share, freedom = share_of_motion(self.motion), self.fit_freedom or self.freedom
-        return share * (freedom + 1) / (freedom + np.maximum(self.surprise(sse), 0.0)) / self.temper
+        freedom = self.fit_freedom or self.freedom
+        return self.share * (freedom + 1) / (freedom + np.maximum(self.surprise(sse), 0.0)) / self.temper
+
+    @property
+    def share(self) -> Float[np.ndarray, "E"]:
+        """See `share_of_motion`."""
+        return share_of_motion(self.motion, self.count > 0)
 
     @property
     def count(self) -> Float[np.ndarray, "E"]:
@@ -112,7 +117,7 @@ class Evidence:
 
 
 def student_log_likelihoods(
-    surprise: Float[np.ndarray, "E"], freedom: float, motion: Int[np.ndarray, "E"]
+    surprise: Float[np.ndarray, "E"], freedom: float, share: Float[np.ndarray, "E"]
 ) -> Float[np.ndarray, "E"]:
     """Student's log likelihood of every episode up to a constant, see `belief`; their sum is that of the recording.
 
@@ -122,11 +127,11 @@ def student_log_likelihoods(
     Args:
         surprise: Q of every episode.
         freedom: of Student's distribution.
-        motion: episodes with the same number repeat one another and share one vote.
+        share: of each episode in the vote of its motion, see `share_of_motion`.
     """
     scaled = surprise / freedom
     each = np.where(scaled > 0, np.log1p(np.maximum(scaled, 0.0)), scaled)
-    return -0.5 * (freedom + 1) * share_of_motion(motion) * each
+    return -0.5 * (freedom + 1) * share * each
 
 
 def repeated_motions(
@@ -162,6 +167,11 @@ def episodes_by_motion(motion: Int[np.ndarray, "E"]) -> list[Int[np.ndarray, "_"
     return [np.flatnonzero(motion == first) for first in np.unique(motion)]
 
 
-def share_of_motion(motion: Int[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
-    """Weight of each episode: 1 over the number of episodes with the same motion."""
-    return 1.0 / (motion[:, None] == motion[None]).sum(axis=1)
+def share_of_motion(motion: Int[np.ndarray, "E"], seen: Bool[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
+    """Share of each episode in the one vote of its motion: 1 over the number of its episodes that were seen.
+
+    Args:
+        motion: episodes with the same number repeat one another.
+        seen: whether there is any observation of an episode; the others have no say.
+    """
+    return 1.0 / np.maximum(((motion[:, None] == motion[None]) & seen[None]).sum(axis=1), 1)

@@ -92,7 +92,10 @@ def measure_gap(
 
     (b, count), (a, _) = squares(before), squares(after)
     noise = floor**2 * count
-    ratio, interval90 = shrinkage(b - noise, a - noise, evidence.motion) if resolvable else (None, None)
+    told = np.flatnonzero(count)
+    ratio, interval90 = None, None
+    if resolvable:
+        ratio, interval90 = shrinkage((b - noise)[told], (a - noise)[told], evidence.motion[told])
     if ratio is not None and not np.isfinite(ratio):  # what only the encoders show
         ratio, interval90 = None, None
     whole = float(f"{(interval * (length - 1)).max():.6g}")

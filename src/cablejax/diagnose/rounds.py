@@ -7,7 +7,8 @@ Recordings contradict one another if the best explanation by an effect needs dif
 tested even if "no effect" is more probable, since an effect in one recording only fits no other. The explanation is
 fitted to every recording alone, starting from the fit to all. For K recordings of one set-up and P parameters, twice
 the nats gained in sum have a chi-squared distribution with P (K - 1) degrees of freedom (Wilks). Every separate fit
-includes its prior, which makes the test cautious.
+includes its prior, but the nats do not, or a recording that shows nothing of the effect would gain by the prior alone;
+no other fit gains less, which makes the test cautious.
 """
 
 from __future__ import annotations
@@ -120,10 +121,11 @@ def rounds_of(log: GapLog, found: Search) -> Rounds | None:
 
 
 def _own_gain(fit: Fit, evidence: Evidence, rows: np.ndarray) -> float:
-    """Nats that a fit to these episodes alone gains, prior included."""
+    """Nats of likelihood that a fit to these episodes alone gains."""
     if not len(fit.explanation.z):
         return 0.0
     alone = evidence.restricted(rows)
     (start,) = evaluate(alone, [fit.explanation])
     (own,) = improve(alone, [start], evidence.simulator.plan.last_steps)
-    return max(start.cost(alone) - own.cost(alone), 0.0)
+    before, after = (0.5 * float(one.explanation.z @ one.explanation.z) for one in (start, own))
+    return max(start.cost(alone) - own.cost(alone) - (before - after), 0.0)

@@ -176,6 +176,7 @@ def weighed(
 
     Where recordings have numbers of their own, the nominal simulator has them fitted: they are no part of the gap.
     """
+    seen = np.isfinite(observed).any(axis=tuple(range(1, observed.ndim)))
     bare = Evidence(
         simulator=simulator,
         episodes=np.arange(len(observed)),
@@ -184,7 +185,8 @@ def weighed(
         noise=noise,
         temper=np.ones(len(observed)),
         freedom=calibration.freedom,
-        motion=motion,
+        # a motion of which nothing was observed is none that can be left out, or drawn
+        motion=np.where(seen, motion, motion[seen.argmax()]),
         fit_freedom=calibration.fit_freedom,
         own_error=own_error,
     )

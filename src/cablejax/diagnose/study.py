@@ -26,7 +26,7 @@ ENDED: dict[Ended, str] = {
     "clear": "The answer is clear.",
     "unknown": "No effect of the library explains the whole gap.",
     "inseparable": "No motion that was tried separates the remaining causes: measure one of them by other means.",
-    "rounds": "All rounds are used up: allow more with --rounds.",
+    "rounds": "All rounds are used up: allow more with --rounds and another --out, which makes these again.",
 }
 """Why a study ended, in words."""
 

@@ -33,6 +33,7 @@ from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import ModelConfig
 from cablejax.simulate.chain.statics import clamped, resting_shapes
+from cablejax.simulate.compile import full_precision
 from cablejax.simulate.keypoints import hermite
 from cablejax.types import History
 
@@ -102,6 +103,7 @@ def frame_of(gripper_pose: Float[Array, "2 3"]) -> Frame:
     return Frame(gripper_pose[:, :2].mean(axis=0), jnp.stack([x, jnp.stack([-x[1], x[0]])]))
 
 
+@full_precision
 def build_graph(
     history: History,
     twist: Float[Array, "2 3"],
@@ -175,6 +177,7 @@ def build_graph(
     )
 
 
+@full_precision
 def prior_of(history: History, twist: Float[Array, "2 3"], config: ModelConfig) -> Prior:
     """The prior's prediction for a command. Differentiable in `history` and `twist`."""
     now, interval = history.keypoints[-1], config.interval

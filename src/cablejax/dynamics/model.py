@@ -48,7 +48,7 @@ def apply(
     axes = frame(history.gripper_pose).axes
     output = network(graph.nodes, graph.edges)  # pyright: ignore[reportArgumentType]
     beyond = output[1:-1] * config.normalisation.residual
-    return prior.displacement + jnp.pad(beyond @ axes, ((1, 1), (0, 0)))
+    return prior.displacement + jnp.pad(jnp.matmul(beyond, axes, precision="highest"), ((1, 1), (0, 0)))
 
 
 def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> OneStepModel:

@@ -17,6 +17,9 @@ GRASP_TOLERANCE = 2e-2
 """Largest distance of an end keypoint from its gripper that is taken for a grasp, in lengths of the cable: cables that
 snap through pull."""
 
+_AT_ONCE = 16
+"""Trajectories of which the prior is computed together."""
+
 
 def check_trajectories(data: Trajectory, config: ModelConfig, *, steps: int, what: str) -> None:
     """Checks that trajectories can train this configuration.
@@ -70,14 +73,15 @@ def fit_normalisation(
     pose, twist = np.asarray(data.gripper_pose, np.float64), np.asarray(data.gripper_twist, np.float64)
     moved = np.diff(x, axis=1)
 
-    @jax.jit
-    @jax.vmap
-    def expected(keypoints, gripper_pose, twist):
+    def expected(of):
+        keypoints, gripper_pose, twist = of
         one = jax.vmap(lambda k, p, u: prior_of(History(k[None], p), u, config).displacement)
         return one(keypoints[:-1], gripper_pose[:-1], twist)
 
-    arrays = (jnp.asarray(leaf, jnp.float32) for leaf in (data.keypoints, data.gripper_pose, data.gripper_twist))
-    beyond = np.mean((moved - np.asarray(expected(*arrays), np.float64))[:, :, 1:-1] ** 2, axis=(2, 3))
+    arrays = tuple(jnp.asarray(leaf, jnp.float32) for leaf in (data.keypoints, data.gripper_pose, data.gripper_twist))
+    # a step of the static prior takes a hundred times the memory of its data
+    prior = jax.jit(lambda arrays: jax.lax.map(expected, arrays, batch_size=_AT_ONCE))(arrays)
+    beyond = np.mean((moved - np.asarray(prior, np.float64))[:, :, 1:-1] ** 2, axis=(2, 3))
     # The few steps in which a cable snaps through would set the scale alone.
     usual = np.sort(beyond.ravel())[: max(1, int(0.95 * beyond.size))]
     origin = np.asarray(jax.vmap(jax.vmap(lambda p: frame(p).origin))(jnp.asarray(pose)), np.float64)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from cablejax.cable_file import cable_of_log
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
 from cablejax.diagnose.judgement import FAINT, effect_title, in_its_place, listed, share
@@ -118,6 +119,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         orbit = {"data": json_script(orbit_data(diagnosis)), "explained": label}
     path = out / PAGE
     named, addable = {effect.name for effect in diagnosis.effects}, sections.addable(diagnosis) and not space
+    simulated = named | {effect.name for draw in getattr(diagnosis, "posterior", ()) for effect in draw}
     write_html(
         path,
         "diagnosis.html",
@@ -130,7 +132,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         works=_works(diagnosis),
         pictures=inline,
         orbit=orbit,
-        trainable=addable and named.isdisjoint(OUTSIDE),
+        trainable=addable and simulated.isdisjoint(OUTSIDE) and cable_of_log(diagnosis.log).marks is None,
         informs=addable and not named.isdisjoint(INFORMING),
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
         where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,
@@ -169,6 +171,8 @@ def _works(diagnosis: CableDiagnosis) -> str:
         said = "The simulated cable moves like the recorded one, to within the noise and the simulator's own error."
     elif diagnosis.effects and gap.shrinkage is not None:
         said = f"With the cause, the gap shrinks by {share(gap.shrinkage)} on episodes that no fit has seen."
+    elif diagnosis.effects and gap.held_out_episodes:
+        said = "The keypoints cannot show it, since even without the cause they are within the noise: the poses do."
     elif diagnosis.effects:
         said = "This log cannot show it, since no motion was held out of the fit: record a second motion."
     else:

@@ -146,6 +146,11 @@ def how_far(diagnosis: CableDiagnosis) -> str:
         text = "There is no gap above the noise to shrink."
     elif diagnosis.explained is None:
         text = "No effect was added to the simulator, so nothing shrinks."
+    elif gap.shrinkage is None and gap.held_out_episodes:
+        text = (
+            "Even without the cause, the errors of the keypoints are within the noise, so there is no gap of theirs "
+            "that could shrink: only the grippers' measured poses show the cause."
+        )
     elif gap.shrinkage is None:
         text = (
             "The log holds one motion, and the fit used all of it. With no held-out motion, how far the gap shrinks is "

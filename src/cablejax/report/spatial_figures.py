@@ -52,7 +52,7 @@ def files_figure(diagnosis: CableDiagnosis) -> Figure:
             for column in recording_ends(diagnosis, used):
                 ax.axvline(column - 0.5, color="white", lw=1.5)
         every = max(1, len(used) // 20)
-        panels[-1].set_xticks(range(0, len(used), every), [names[e] for e in used[::every]])
+        panels[-1].set_xticks(range(0, len(used), every), [names[e].replace("$", r"\$") for e in used[::every]])
         panels[-1].set_xlabel("file")
         assert image is not None
         figure.colorbar(image, ax=list(panels), label="mm, root mean square", shrink=0.8)
@@ -103,8 +103,11 @@ def orbit_data(diagnosis: CableDiagnosis) -> dict[str, Any]:
 
     windows = []
     for e in chosen:
-        count = int(min(log.episode_length[e], round(5.0 / interval)))
-        samples = slice(0, count, every)
+        # the camera may have begun later
+        known = np.isfinite(log.keypoints[e]) & np.isfinite(diagnosis.nominal[e])
+        first = int(known.any(axis=(1, 2)).argmax())
+        count = int(min(log.episode_length[e] - first, round(5.0 / interval)))
+        samples = slice(first, first + count, every)
         observed = np.asarray(log.keypoints[e, samples], float)
         entry: dict[str, Any] = {
             "name": f"{names[e]} ({size[e]:.0f} mm)",
