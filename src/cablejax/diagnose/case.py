@@ -92,10 +92,7 @@ class Case:
             DiagnosisError: the log cannot be diagnosed; the message says why and what to do.
         """
         recording = prepare(log)
-        try:
-            noise = noise_floor(recording.keypoints, recording.hold)
-        except ValueError as error:
-            raise DiagnosisError(str(error)) from error
+        noise = _noise_of(recording)
         arms = actuation(
             recording.gripper_pose,
             recording.gripper_command if recording.has_commands else None,
@@ -258,6 +255,13 @@ class Case:
     def to_log(self, keypoints: Float[np.ndarray, "E T N 2"]) -> Float[np.ndarray, "E T1 N 2"]:
         """Pads an array to the log's length, with NaN beyond each episode's end."""
         return np.where(self.recording.valid[..., None, None], keypoints, np.nan)[:, : self.recording.length.max()]
+
+
+def _noise_of(recording: Recording) -> NoiseFloor:
+    try:
+        return noise_floor(recording.keypoints, recording.hold)
+    except ValueError as error:
+        raise DiagnosisError(str(error)) from error
 
 
 def _steadied(pose: Float[np.ndarray, "E T 2 3"], recording: Recording, arms: Actuation):
