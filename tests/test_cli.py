@@ -4,10 +4,14 @@ import importlib.metadata
 import itertools
 import json
 import os
+import pathlib
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import types
+from typing import Any
 
 import pytest
 
@@ -15,6 +19,8 @@ from cablejax.cable import Cable
 from cablejax.cable_file import write_cable
 from cablejax.cli import main
 from cablejax.commands import options
+from cablejax.commands.train import _names
+from cablejax.dynamics.weights import weights_path
 
 SUBCOMMANDS = (["demo"], ["simulate"], ["train"], ["shape"], ["bench"], ["bench", "simulate"], ["bench", "mpc"])
 
@@ -223,3 +229,21 @@ def test_importing_the_simulators_prints_nothing():
 def test_text_table_lines_up():
     text = options.text_table(["shape", "error"], [["U", "0.5"], ["long name", "12.25"]])
     assert text.splitlines()[1:] == ["---------  -----", "U            0.5", "long name  12.25"]
+
+
+def test_a_training_does_not_replace_the_weights_that_it_starts_from(tmp_path, capsys):
+    out = tmp_path / "model"
+    out.mkdir()
+    weights = out / "weights.safetensors"
+    shutil.copy(weights_path("gns-reference"), weights)
+    for start in (out, weights):
+        assert main(["train", "--data", "nowhere.zarr", "--start-from", str(start), "--out", str(out)]) == 2
+        assert "where the training writes its own weights. Name another folder" in capsys.readouterr().err
+    assert weights.read_bytes() == weights_path("gns-reference").read_bytes()
+
+
+def test_data_sets_of_one_name_are_told_apart():
+    stores: list[Any] = [
+        types.SimpleNamespace(path=pathlib.Path(place)) for place in ("x/a.zarr", "y/a.zarr", "z/a 1.zarr", "b")
+    ]
+    assert _names(stores) == ["a 2", "a 3", "a 1", "b"]
