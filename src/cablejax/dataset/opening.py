@@ -151,12 +151,7 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
     faulty = [f"{name}/zarr.json" for name in _arrays(config) if _fault(store, name)]
     descriptions = _descriptions(config, versions) if faulty else {}
     for name in faulty:  # the trajectories stay: each is checked against its digest
-        if isinstance(place, Bucket):
-            place.write(name, descriptions[name])
-            continue
-        (place / name).parent.mkdir(exist_ok=True)
-        with whole_file(place / name) as stream:
-            stream.write(descriptions[name])
+        _write(place, name, descriptions[name])
     return recorded_store(place, "r+") if faulty else store
 
 
@@ -190,12 +185,8 @@ def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None
                 return
             if not path.is_dir() or any(path.iterdir()):
                 raise
-            files = sorted(draft.rglob("zarr.json"), key=lambda file: file.parent == draft)
-            for file in files:
-                place = path / file.relative_to(draft)
-                place.parent.mkdir(parents=True, exist_ok=True)
-                with whole_file(place) as stream:
-                    stream.write(file.read_bytes())
+            for name, content in _descriptions(config, versions).items():
+                _write(path, name, content)
 
 
 def _create_in_bucket(bucket: Bucket, config: DatasetConfig, versions: dict[str, str]) -> None:
@@ -210,17 +201,27 @@ def _create_in_bucket(bucket: Bucket, config: DatasetConfig, versions: dict[str,
         return
     if any(not name.endswith("/zarr.json") for name in names):
         raise ValueError(f"{bucket} holds objects, but no data set. Give a new prefix; nothing was changed.")
-    descriptions = _descriptions(config, versions)
-    for name in sorted(descriptions, key=lambda name: name == "zarr.json"):
-        bucket.write(name, descriptions[name])
+    for name, content in _descriptions(config, versions).items():
+        _write(bucket, name, content)
+
+
+def _write(place: Path | Bucket, name: str, content: bytes) -> None:
+    """Writes a description, whole or not at all."""
+    if isinstance(place, Bucket):
+        place.write(name, content)
+        return
+    (place / name).parent.mkdir(exist_ok=True)
+    with whole_file(place / name) as stream:
+        stream.write(content)
 
 
 def _descriptions(config: DatasetConfig, versions: dict[str, str]) -> dict[str, bytes]:
-    """The files of an empty store, by their names."""
+    """The files of an empty store by their names, its own last, as it says that the others are there."""
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "draft"
         _fill(draft, config, versions)
-        return {str(file.relative_to(draft)): file.read_bytes() for file in draft.rglob("zarr.json")}
+        files = sorted(draft.rglob("zarr.json"), key=lambda file: file.parent == draft)
+        return {str(file.relative_to(draft)): file.read_bytes() for file in files}
 
 
 def _fill(folder: Path, config: DatasetConfig, versions: dict[str, str]) -> None:

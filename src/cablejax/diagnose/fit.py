@@ -68,8 +68,12 @@ class Fit:
         """Negative log posterior density up to a constant."""
         own = self.explanation.own[np.unique(self.recording)]
         prior = 0.5 * float(self.explanation.z @ self.explanation.z) + 0.5 * float((own**2).sum())
+        return prior + self.misfit(evidence)
+
+    def misfit(self, evidence: Evidence) -> float:
+        """Negative log likelihood up to a constant."""
         freedom = evidence.fit_freedom or evidence.freedom
-        return prior - float(student_log_likelihoods(evidence.surprise(self.sse), freedom, evidence.share).sum())
+        return -float(student_log_likelihoods(evidence.surprise(self.sse), freedom, evidence.share).sum())
 
     def precision(self, evidence: Evidence) -> Float[np.ndarray, "P P"]:
         """Inverse posterior covariance of the shared coordinates, by Laplace's approximation with fixed weights."""

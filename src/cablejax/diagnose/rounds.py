@@ -127,5 +127,4 @@ def _own_gain(fit: Fit, evidence: Evidence, rows: np.ndarray) -> float:
     alone = evidence.restricted(rows)
     (start,) = evaluate(alone, [fit.explanation])
     (own,) = improve(alone, [start], evidence.simulator.plan.last_steps)
-    before, after = (0.5 * float(one.explanation.z @ one.explanation.z) for one in (start, own))
-    return max(start.cost(alone) - own.cost(alone) - (before - after), 0.0)
+    return max(start.misfit(alone) - own.misfit(alone), 0.0)

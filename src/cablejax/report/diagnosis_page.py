@@ -119,7 +119,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         orbit = {"data": json_script(orbit_data(diagnosis)), "explained": label}
     path = out / PAGE
     named, addable = {effect.name for effect in diagnosis.effects}, sections.addable(diagnosis) and not space
-    simulated = named | {effect.name for draw in getattr(diagnosis, "posterior", ()) for effect in draw}
+    simulated = named | {effect.name for draw in diagnosis.posterior for effect in draw}
     write_html(
         path,
         "diagnosis.html",
