@@ -56,7 +56,7 @@ class Conclusion:
         leftover_p: of the test whether it leaves more than a right one does, by `belief.leftover_p`; None: no gap.
         posterior: see `Diagnosis`.
         under_laws: see `Diagnosis`.
-        undecided: whether an effect that pays too little for itself would leave nothing, where none is named.
+        undecided: see `Diagnosis`.
         nothing: share of the posterior's draws in which the observations show no effect.
     """
 
@@ -113,13 +113,9 @@ def _concluded(
     )
     if not best.explanation.terms:
         # an effect would do, and yet the gap is too small or in too few motions to pay for it
-        undecided = any(
-            calibration.complete(excess(fit, evidence), gap, level(evidence))
-            for fit in found.fits
-            if fit.explanation.terms
-        )
+        undecided = any(found.complete(fit) for fit in found.fits if fit.explanation.terms)
         return dataclasses.replace(unknown, undecided=undecided), nothing
-    complete = calibration.complete(left, gap, level(evidence))
+    complete = found.complete(best)
     if not _telling(best, unknown.explained, complete, found):
         return unknown, nothing
 

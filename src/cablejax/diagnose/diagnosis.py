@@ -218,6 +218,8 @@ class Diagnosis:
         effects: effects named as the cause; empty for "none" and "unknown".
         equivalent: sets of effects that are indistinguishable on this log.
         ranking: every effect tried, most probable first; of a forward search, every trial in order.
+        undecided: whether the verdict is "unknown" because the log shows too little of the gap: effects of the library
+            would explain it, and none can be named.
         leftover_p: chance that a right explanation leaves as much error as the best one, see `belief.leftover_p`; None
             without a gap, or without labelled logs like this one.
         gap: before and after.
@@ -242,6 +244,7 @@ class Diagnosis:
     effects: tuple[NamedEffect, ...]
     equivalent: tuple[tuple[str, ...], ...]
     ranking: tuple[Ranked, ...]
+    undecided: bool = False
     leftover_p: float | None = None
     gap: Gap
     where: Where | None

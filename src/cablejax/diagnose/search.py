@@ -85,20 +85,27 @@ class Search:
         """Indices of the fits of one effect."""
         return [i for i, fit in enumerate(self.fits) if len(effect_names(fit.explanation)) == 1]
 
+    def complete(self, fit: Fit) -> bool:
+        """Whether what a fit leaves of the gap needs no other cause."""
+        left, gap = excess(fit, self.evidence), excess(self.null, self.evidence)
+        return self.calibration.complete(left, gap, level(self.evidence))
+
     def in_doubt(self) -> tuple[list[Fit], Float[np.ndarray, "K"]]:
         """Explanations that a verdict leaves open, and their probabilities, sum 1.
 
         Those whose odds against the best are not small. One with another effect in the place of one of the best's that
         merely leaves as little counts as if its odds were the smallest of these: a likelihood is that sure only if
-        every law is exact.
+        every law is exact. So does one that needs no other cause, where the best is the nominal simulator: the log
+        shows too little of the gap to pay for an effect.
         """
         best, least = self.fits[0], self.calibration.set_odds
         names, kept, odds = set(effect_names(best.explanation)), [], []
         for fit, chance in zip(self.fits, np.exp(self.scores - self.scores[0]).tolist(), strict=True):
             own = set(effect_names(fit.explanation))
             in_place = len(own) == len(names) and len(own & names) >= len(names) - 1
-            if chance < least and in_place and as_good(fit, best, self.evidence, self.calibration):
-                chance = least
+            as_likely = in_place and as_good(fit, best, self.evidence, self.calibration)
+            if as_likely or (own and not names and self.complete(fit)):
+                chance = max(chance, least)
             if chance >= least:
                 kept.append(fit)
                 odds.append(chance)

@@ -96,10 +96,9 @@ def ended(found: Diagnosis, worth: Mapping[str, Any] | None, *, rounds_left: int
         worth: of the next motion, as `verdict_json` writes it; None where there is none.
         rounds_left: how many recordings may still be made.
     """
-    if found.verdict in ("unknown", "named+unknown"):
-        return "unknown"
-    if found.verdict != "ambiguous" or all(len(names) == 1 for names in alternatives(found)):
-        return "clear"
+    several = found.verdict == "ambiguous" and any(len(names) > 1 for names in alternatives(found))
+    if not several and not found.undecided:
+        return "unknown" if found.verdict in ("unknown", "named+unknown") else "clear"
     if worth is None or worth["inseparable"]:
         return "inseparable"
     return None if rounds_left > 0 else "rounds"

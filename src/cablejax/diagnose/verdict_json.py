@@ -43,11 +43,12 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     (2 on a table, 3 in space, null for a simulator of one's own and a hanging wire), `place_m` (where the grippers are
     on average, in the world of the effects' places; null in space), `sentence`, `baselines`, `leftover_p`, `caveats`,
     `seconds`, `quantities` (by name, like an effect's parameters), `posterior` (fields of `EffectValues`), `under_laws`
-    (fields of `UnderLaw`) and `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`, and whether no
-    motion that was tried separates the explanations; of several recordings `rounds`, the fields of `Round`, and
-    `rounds_contradict`. `next_motion` is recommended only where that is false. `gap` has also `unit`, `before_rmse`,
-    `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`, an effect also `alike`, `ranking`
-    also `leftover_mm` and `outcome`, and `where` also `sentences`, `per_horizon_mm`, `frames` and `along_share`.
+    (fields of `UnderLaw`), `undecided` and `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`, and
+    whether no motion that was tried separates the explanations; of several recordings `rounds`, the fields of `Round`,
+    and `rounds_contradict`. `next_motion` is recommended only where that is false. `gap` has also `unit`,
+    `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`, an effect also
+    `alike`, `ranking` also `leftover_mm` and `outcome`, and `where` also `sentences`, `per_horizon_mm`, `frames` and
+    `along_share`.
     """
     gap, rounds = diagnosis.gap, getattr(diagnosis, "rounds", None)
     return _plain(
@@ -71,6 +72,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 dataclasses.asdict(one) | {"leftover_mm": one.leftover_mm if gap.unit == "m" else None}
                 for one in diagnosis.ranking
             ],
+            "undecided": diagnosis.undecided,
             "leftover_p": diagnosis.leftover_p,
             # what no effect was named for has not shrunk, however much an explanation that was not believed takes away
             "gap": _gap(gap, blamed=diagnosis.verdict != "unknown"),
@@ -105,8 +107,7 @@ def _place(diagnosis: Diagnosis) -> list[float] | None:
 
 def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib.Path:
     """Writes the verdict, whole or not at all, over what was there, and returns its path."""
-    path = pathlib.Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    (path := pathlib.Path(path)).parent.mkdir(parents=True, exist_ok=True)
     write_json(path, verdict_json(diagnosis))
     return path
 
@@ -135,6 +136,7 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
                 )
                 for r in verdict["ranking"]
             ),
+            undecided=verdict.get("undecided") is True,
             leftover_p=_chance(verdict["leftover_p"]),
             gap=Gap(
                 horizon_s=float(gap["horizon_s"]),
@@ -202,7 +204,7 @@ def _number(value: Any) -> Any:
 
 
 def _chance(value: Any) -> Any:
-    """The same value if it is a probability, or None where it is null. Raises TypeError otherwise."""
+    """The same value if it is a probability or null. Raises TypeError otherwise."""
     if value is not None and value not in LIMITS["probability"]:
         raise TypeError(f"{shown(value)} is not a probability")
     return value
@@ -283,10 +285,9 @@ def _where(where: Where) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     """The same with Python's own types only; numbers to six digits, and None for those that are not finite."""
+    value = value.tolist() if isinstance(value, np.ndarray) else value
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
     if isinstance(value, (list, tuple)):
         return [_plain(entry) for entry in value]
     if isinstance(value, (bool, np.bool_)):

@@ -51,9 +51,9 @@ class CloudPlant(Plant):
                 f"The tracker looks for {wanted.n_keypoints} keypoints on {wanted.length} m of cable, but the plant "
                 f"has {cable.n_keypoints} on {cable.length} m: give both the same, for example by tracker_for(cable)."
             )
-        self._forget()
+        self._lose_track()
 
-    def _forget(self) -> None:
+    def _lose_track(self) -> None:
         self._state: TrackState | None = None
         self.track: Track | None = None
         self.cloud: Float[np.ndarray, "S 3"] = np.zeros((0, 3))
@@ -63,7 +63,7 @@ class CloudPlant(Plant):
         self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
     ) -> Observation:
         """As `Plant.reset`; the tracker finds the new cable without a prior, and the camera's noise starts again."""
-        self._forget()
+        self._lose_track()
         self.camera.reset()
         return super().reset(gripper_pose, guess=guess)
 

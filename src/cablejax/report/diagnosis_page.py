@@ -175,6 +175,8 @@ def _works(diagnosis: CableDiagnosis) -> str:
         said = "The keypoints cannot show it, since even without the cause they are within the noise: the poses do."
     elif diagnosis.effects:
         said = "This log cannot show it, since no motion was held out of the fit: record a second motion."
+    elif diagnosis.undecided:
+        said = "Not on this log: effects of the library would explain the gap, but it shows too little to name one."
     else:
         said = "Not on this log: no effect of the library explains enough of the gap, so none is named."
     return f"{said} This verdict has {counted(limits, 'limit')}: see the end of the page." if limits else said
@@ -196,7 +198,8 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
         yield ("Cause", "none needed", f"a gap of {millimetres(least)} would have shown{where}")
     else:
         best = max(diagnosis.ranking, key=lambda r: (r.probability or 0.0, r.held_out_shrinkage), default=None)
-        note = "" if best is None else f"closest: {effect_title(best.name)}, which is not enough"
+        enough = "but the log shows too little of it" if diagnosis.undecided else "which is not enough"
+        note = "" if best is None else f"closest: {effect_title(best.name)}, {enough}"
         yield ("Cause", "unknown", note)
         yield ("Place of the cause", "unknown", _peak(diagnosis))
     if gap.shrinkage is not None and diagnosis.explained is not None:

@@ -99,8 +99,10 @@ def _error(found: Diagnosis) -> str:
 def _causes(found: Diagnosis) -> str:
     """What is named, and what could be in the place of each: "a or b" of one effect, "a (or b) and c" of two."""
     named = [[effect_title(name) for name in names] for names in alternatives(found)]
+    if not named:
+        return "undecided" if found.undecided else _VERDICTS[found.verdict]
     if len(named) < 2:
-        return listed(named[0], "or") if named else _VERDICTS[found.verdict]
+        return listed(named[0], "or")
     return listed([f"{name} (or {listed(others, 'or')})" if others else name for name, *others in named])
 
 

@@ -52,7 +52,9 @@ def caveats(
         "values from that fit, on recordings that no fit has seen.",
     ]
     if "gripper_rotation_offset" in found.tried:
-        grips = GRIP * found.everything.explanation.own[np.unique(windows.group)]
+        fitted = found.everything.explanation.own
+        # of a recording whose windows are all too short for a fit there is none
+        grips = GRIP * np.array([fitted[group] for group in np.unique(windows.group) if group < len(fitted)])
         result.append(
             "The angle of the cable in the grippers is fitted for each recording: it differs by "
             f"{np.sqrt((grips**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen "
