@@ -113,6 +113,20 @@ def test_a_rival_that_leaves_as_little_is_a_look_alike():
     assert len({draw[0].parameters["ratio"] for draw in posterior[:8]}) == 8
 
 
+def test_what_does_not_pay_for_itself_stays_open_where_the_nominal_simulator_ranks_first():
+    """A gap of which the log shows too little: the next motion is chosen between its complete explanations and none."""
+    fits, found = soft_and_dragged()
+    best_first = (fits[-1], *fits[:-1])
+    open_ = dataclasses.replace(found, fits=best_first, scores=np.array([0.0, -20.0, -30.0]))
+    conclusion = conclude(open_)
+    assert conclusion.verdict == "unknown" and conclusion.undecided
+    assert "too little of it to name the cause" in sentence(conclusion, None)
+    kept, chances = open_.in_doubt()
+    complete = [fit for fit in fits[:-1] if open_.complete(fit)]
+    assert complete and list(map(id, kept)) == list(map(id, [fits[-1], *complete]))
+    assert chances.sum() == pytest.approx(1.0) and (chances[1:] > 0.01).all()
+
+
 def test_of_few_motions_an_explanation_that_leaves_a_little_more_is_as_good():
     facts = evidence(noise_mm=0.5)
     (fit,) = evaluate(facts, [explanation()])
