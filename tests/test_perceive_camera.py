@@ -101,6 +101,14 @@ def test_a_camera_that_sees_the_horizon_is_refused():
         DepthCamera(CameraConfig(tilt=1.2, field_of_view=1.0), CABLE)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"), [({"field_of_view": 45.0}, "field_of_view is 45"), ({"min_neighbours": 9}, "expected 0 to 8")]
+)
+def test_a_camera_that_cannot_see_a_cable_is_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        CameraConfig(**wrong)
+
+
 @pytest.fixture(scope="module")
 def plant() -> CloudPlant:
     return CloudPlant(SMALL_PLANT, camera=CAMERA, tracker=TRACKER)

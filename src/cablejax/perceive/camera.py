@@ -63,11 +63,15 @@ class CameraConfig:
         check(
             self,
             distance="positive",
-            field_of_view="positive",
+            field_of_view="angle",
             range_noise="noise",
             dropout="probability",
             outliers="probability",
         )
+        if not 0 <= self.min_neighbours <= 8:
+            raise ValueError(
+                f"CameraConfig.min_neighbours is {self.min_neighbours}, expected 0 to 8, a pixel's neighbours."
+            )
         if not 0 <= self.tilt <= 1.2:
             raise ValueError(
                 f"CameraConfig.tilt is {self.tilt} rad, expected 0 (straight above) to 1.2: a flatter view cannot show "
