@@ -52,6 +52,8 @@ def test_the_file_has_every_field_of_a_cable():
         ({"length_m": None, "length": 1.5}, "length without its unit: write length_m, in m"),
         ({"density": 0.08}, "unknown key 'density'. Did you mean linear_density_kg_per_m"),
         ({"diameter_mm": 10}, "Did you mean diameter_m"),
+        ({"keypoint": 13}, r"unknown key 'keypoint'\. Did you mean keypoint"),
+        ({"keypoint_arclength": [0.0, 1.0]}, "keypoint_arclength without its unit: write keypoint_arclength_m, in m"),
         ({"colour": "red"}, "Expected length_m, diameter_m"),
         ({"bending_stiffness_n_m2": None}, "lacks bending_stiffness_n_m2, the EI"),
         ({"length_m": -1.0}, "length_m is -1.0, expected a number from 0.01 to 100 m"),

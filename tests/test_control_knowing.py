@@ -253,6 +253,11 @@ def test_of_look_alikes_a_model_is_informed_of_the_first_that_enters_it(tmp_path
     conditioned = load_model("gns-conditioned")
     assert not enters(conditioned, (parse_effect(patch),))
     assert known_from(conditioned, (), (path,)) == (parse_effect(friction),)
+    # of a robot whose world begins elsewhere, too
+    named["parameters"]["x_m"] = {"value": 4.7}
+    verdict["posterior"][0][0]["parameters"]["x_m"] = 4.7
+    path.write_text(json.dumps({**verdict, "place_m": [4.5, 0.0]}))
+    assert known_from(conditioned, (), (path,)) == (parse_effect(friction),)
     # neither enters a model that knows no friction: the message is about what was named
     with pytest.raises(ValueError, match="Nothing of friction_patch"):
         knowing(load_model("gns-reference"), known_from(load_model("gns-reference"), (), (path,)))

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,10 +13,23 @@ from cablejax.diagnose.case import calibrated
 from cablejax.diagnose.conclude import Conclusion, sentence
 from cablejax.diagnose.diagnosis import EffectValues
 from cablejax.diagnose.fit import Fit
+from cablejax.effects.arms import lag_weights, lagged
 from diagnose_cases import INTERVAL, MOTIONS, poses
 
 FINE = 20
 """Steps between two samples in which the true lag is integrated."""
+
+
+def test_a_slow_arm_that_rests_far_from_the_origin_does_not_drift():
+    poses = np.full((2000, 2, 3), 100.0, np.float32)
+    for xp in (np, jnp):
+        assert (np.asarray(lagged(xp.asarray(poses), 0.1, 0.25, np.float32(30.0))) == 100.0).all()
+
+
+def test_weights_of_a_slow_lag_add_up_in_single_precision():
+    kept, before, after = lag_weights(np.float32(300.0))
+    assert float(before) == pytest.approx(0.5 / 300, rel=1e-2) and float(after) == pytest.approx(0.5 / 300, rel=1e-2)
+    assert float(kept + before + after) == pytest.approx(1.0, abs=2e-7)
 
 
 def commands() -> np.ndarray:

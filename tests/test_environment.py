@@ -140,7 +140,8 @@ def test_effects_targets_and_random_parameters_change_the_episode():
     plain = rollout(env, actions, target="S")
     again = rollout(env, actions, target="S", effects=["bending_stiffness:ratio=0.1", "table_friction:coefficient=0.5"])
     shift = np.abs(again - plain).max(axis=(1, 2))
-    assert shift[0] == 0.0 and shift[-1] > 1e-3
+    # it lies there anew, with other rounding
+    assert shift[0] < 1e-6 and shift[-1] > 1e-3
     np.testing.assert_array_equal(env.reset(options={"target": "U"})[0]["target"].shape, (7, 2))
     varied = ShapeCableEnv(dataclasses.replace(clean(), randomisation=Randomisation(stiffness=(0.1, 0.2))))
     assert np.abs(rollout(varied, actions, target="S") - plain)[-1].max() > 1e-3
@@ -196,8 +197,9 @@ def test_a_cable_that_diverges_ends_its_episode_alone(value):
     many = ShapeCableVectorEnv(3, clean())
     many.reset(seed=0)
     many.cables._state.qpos[1] = value
-    seen, _, terminated, _, _ = many.step(np.zeros((3, 2, 3)))
+    seen, _, terminated, _, _ = many.step(np.full((3, 2, 3), 0.1))
     assert terminated.tolist() == [False, True, False] and many.observation_space.contains(seen)
+    assert not many.cables.executed[1].any()
     seen, rewards, terminated, _, _ = many.step(np.zeros((3, 2, 3)))
     assert not terminated.any() and rewards[1] == 0.0
     seen, rewards, terminated, _, _ = many.step(np.zeros((3, 2, 3)))

@@ -80,7 +80,16 @@ def test_stray_pixels_of_the_table_are_left_out():
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"tilt": 1.5}, "tilt"), ({"dropout": 2.0}, "dropout"), ({"range_noise": -1.0}, "range_noise")],
+    [
+        ({"tilt": 1.5}, "tilt"),
+        ({"dropout": 2.0}, "dropout"),
+        ({"range_noise": -1.0}, "range_noise"),
+        ({"centre": (np.nan, 0.0)}, "centre is nan"),
+        ({"azimuth": np.inf}, "azimuth is inf"),
+        ({"gripper_overlap": -0.1}, r"gripper_overlap is -0\.1"),
+        ({"occluders": ((0.0, 0.0, 0.0, 0.1, 0.1),)}, "occluders has .*expected .x, y, z, half x"),
+        ({"occluders": ((0.0, 0.0, 0.0, 0.1, 0.1, -0.1),)}, "with positive halves"),
+    ],
 )
 def test_impossible_cameras_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
@@ -157,6 +166,12 @@ def test_tracker_and_plant_must_be_about_the_same_cable():
     )
     with pytest.raises(ValueError, match="13 keypoints"):
         CloudPlant(other, camera=CAMERA, tracker=TRACKER)
+
+
+def test_noise_that_a_camera_would_not_use_is_refused():
+    noisy = dataclasses.replace(SMALL_PLANT, keypoint_noise=1e-3)
+    with pytest.raises(ValueError, match=r"no use for keypoint_noise: .* `CameraConfig`"):
+        CloudPlant(noisy, camera=CAMERA, tracker=TRACKER)
 
 
 def test_a_tracker_finds_evenly_spaced_keypoints_only():

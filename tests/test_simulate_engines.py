@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.effects.given import parse_effect, with_effects
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import ChainEngine, MjxEngine, ThreadedEngine
 from cablejax.simulate.composite import build_grasped_chain
@@ -158,12 +159,44 @@ def test_twists_beyond_the_cables_reach_are_warned_of_where_they_are_differentia
     state, params = engine.initial_state(np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])), nominal_physics(engine.config)
     apart = jnp.zeros((1, 2, 3)).at[0, 1, 0].set(1e-3)
     for direction in (apart, jnp.zeros_like(apart)):
-        with pytest.warns(UserWarning, match=r"commanded 1\.0010 m apart but the cable is 1 m long"):
+        with pytest.warns(UserWarning, match=r"driven 1\.0010 m apart but the cable is 1 m long"):
             jax.jvp(lambda twist: engine.rollout(params, state, twist)[1].keypoints, (apart,), (direction,))
-    with pytest.warns(UserWarning, match=r"commanded 1\.0000 m apart .* it is taut"):
+    with pytest.warns(UserWarning, match=r"driven 1\.0000 m apart .* it is taut"):
         engine.rollout(params, state, jnp.zeros_like(apart))
     slack = engine.initial_state(np.array([[-0.499, 0.0, 0.0], [0.499, 0.0, 0.0]]))
     engine.rollout(params, slack, apart)  # within reach: no warning, which would be an error here
+    far = dataclasses.replace(params, actuation_gain=np.float32(3.0))
+    with pytest.warns(UserWarning, match=r"driven 1\.0010 m apart"):
+        engine.rollout(far, slack, apart)
+
+
+@pytest.mark.parametrize("engine", [ChainEngine, MjxEngine, ThreadedEngine])
+def test_a_cable_that_lies_otherwise_than_the_nominal_one_rests_before_the_first_command(engine):
+    engine = engine(Discretisation(n_links=13))
+    bent = parse_effect("intrinsic_curvature:centre_m=0.3,width_m=0.2,curvature_per_m=5")
+    physics = with_effects(nominal_physics(engine.config), [bent], engine.config)
+    laid, still = engine.initial_state(planar_pose()), np.zeros((2, 2, 3))
+
+    def moved(state):
+        points = np.asarray(engine.rollout(physics, state, still)[1].keypoints)
+        return np.abs(points - points[0]).max()
+
+    rested = engine.settled(physics, laid)
+    assert moved(rested) < 1e-3 < 0.01 < moved(laid)
+    np.testing.assert_allclose(rested.gripper_pose, laid.gripper_pose, atol=1e-6)
+    assert not np.asarray(rested.qvel).any()
+
+
+def test_what_happens_at_a_time_happens_after_a_cable_has_settled():
+    """Slip at 1.5 s is that of an episode, and arms that lag have not moved before it."""
+    engine = ChainEngine(Discretisation(n_links=13))
+    texts = "gripper_slip:gripper=1,time_s=1.5,distance_m=0.03", "actuation_lag:time_s=0.3"
+    physics = with_effects(nominal_physics(engine.config), map(parse_effect, texts), engine.config)
+    state = engine.settled(physics, engine.initial_state(planar_pose()))
+    assert float(state.memory.time) == 0.0
+    points = np.asarray(engine.rollout(physics, state, np.zeros((3, 2, 3)))[1].keypoints)
+    apart = np.abs(np.diff(points, axis=0)).max(axis=(1, 2))
+    assert apart[0] < 5e-4 < 5e-3 < apart[1]
 
 
 def test_links_shorter_than_thick_have_an_inertia_that_mujoco_takes():

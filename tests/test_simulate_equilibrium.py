@@ -13,6 +13,7 @@ from cablejax.simulate.equilibrium import (
     angles_of_keypoints,
     arch_angles,
     beyond_joints,
+    equilibrium_state,
     find_equilibrium,
     links_of,
 )
@@ -75,6 +76,13 @@ def test_a_pose_out_of_reach_is_refused():
     config = Discretisation(n_links=13)
     with pytest.raises(ValueError, match=r"1\.2000 m apart"):
         find_equilibrium(config, np.array([[-0.6, 0, 0], [0.6, 0, 0.0]]), np.zeros(12))
+
+
+def test_a_guess_of_another_number_of_cables_is_refused():
+    """One guess of 24 points for two cables was taken for two of 12."""
+    pose = np.tile([[-0.4, 0.0, 0.9], [0.4, 0.0, -0.5]], (2, 1, 1))
+    with pytest.raises(ValueError, match=r"guess has shape \(24, 2\), expected \(2, N, 2\)"):
+        equilibrium_state(Discretisation(n_links=13), pose, guess=np.zeros((24, 2)))
 
 
 def test_a_guess_is_read_at_the_marks_of_the_cable():

@@ -24,7 +24,7 @@ from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock, thinned, with_poses_in_time
 from cablejax.spatial.diagnose import _ranking, diagnose_space
 from cablejax.spatial.estimate import Estimate
-from cablejax.spatial.gap import OWN, in_log, is_gap, own_error, smallest_gap, where_of, with_gap
+from cablejax.spatial.gap import OWN, is_gap, own_error, smallest_gap, where_of, with_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import TWISTED, Identified, _searched, _twisted, layout_of
 from cablejax.spatial.judge import _equivalent
@@ -156,7 +156,7 @@ def test_grippers_that_rest_are_never_fast():
     windows = windows_of(log)
     windows = dataclasses.replace(windows, position=np.broadcast_to(windows.position[:1, :1], windows.position.shape))
     before = np.nan_to_num(windows.keypoints) + 0.01
-    where = where_of(log, windows, in_log(log, windows, before), before, 1e-4, 1e-3, ())
+    where = where_of(log, windows, before, 1e-4, 1e-3, ())
     assert set(where.regimes) == {"speed: slow"} and not any("nan" in text for text in where.sentences)
 
 

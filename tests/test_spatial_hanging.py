@@ -333,8 +333,9 @@ def test_a_wire_far_softer_than_a_traced_one_comes_to_rest_or_has_none():
 
 
 def test_single_precision_is_refused():
+    taken = photographs(0.0, 1.0)
     with jax.enable_x64(False), pytest.raises(ValueError, match="double precision"):
-        HangingWire(photographs(0.0, 1.0))
+        HangingWire(taken)
 
 
 @needs_wires

@@ -6,6 +6,7 @@ import difflib
 import json
 import os
 import pathlib
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,6 +15,9 @@ import numpy as np
 
 from cablejax.limits import require, shown
 from cablejax.whole_file import whole_file
+
+# What is left of a key without the name of its quantity.
+_UNIT = re.compile(r"(_(m|m2|kg|s|n|rad|per))+")
 
 
 def write_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
@@ -153,7 +157,7 @@ def unknown_key(key: str, units: Mapping[str, str]) -> str:
         key: that is unknown.
         units: of every key that is known; keys of quantities end in their unit.
     """
-    if bare := [known for known in units if known.startswith(f"{key}_")]:
+    if bare := [known for known in units if _UNIT.fullmatch(known.removeprefix(key))]:
         return f"{key} without its unit: write {bare[0]}, in {units[bare[0]]}."
     near = [known for known in units if key and key in known]
     near = near or difflib.get_close_matches(key, units, 1, 0.5)

@@ -22,7 +22,7 @@ from cablejax.diagnose.judgement import listed
 from cablejax.dynamics.weights import fingerprint
 from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.effects.physics import nominal_physics
-from cablejax.effects.verdicts import effects_of_verdict, posterior_of_verdict
+from cablejax.effects.verdicts import explanations_of_verdict
 from cablejax.limits import require
 from cablejax.mpc import MPCConfig
 from cablejax.perceive.camera import CameraConfig
@@ -158,9 +158,9 @@ def known_from(model: Model, given: Sequence[str], verdicts: Sequence[pathlib.Pa
     check_verdicts(verdicts, model.cable, "Take a model that was trained on the verdict's cable.")
     known = list(map(parse_effect, given))
     for path in verdicts:
-        named = effects_of_verdict(path)
-        explanations = (named, *posterior_of_verdict(path))
-        known += next((effects for effects in explanations if enters(model, effects)), named)
+        # about the log's grippers: places do not enter a model, and a robot's world may begin metres away
+        named, *drawn = explanations_of_verdict(path)
+        known += next((effects for effects in (named, *drawn) if enters(model, effects)), named)
     return tuple(known)
 
 

@@ -284,5 +284,7 @@ def _rollout(config: DatasetConfig, engine: Engine, draws: Sequence[Draw]) -> Tr
     # a data set has the same bytes whatever JAX's default precision is
     with jax.enable_x64(False):
         state = engine.initial_state(jnp.stack([item.gripper_pose for item in draws]))
+        if config.effects or config.posterior:
+            state = engine.settled(params, state, config.interval)
         twist = jnp.stack([item.gripper_twist for item in draws])
         return engine.rollout(params, state, twist, config.interval)[1]

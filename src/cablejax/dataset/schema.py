@@ -70,7 +70,8 @@ class DatasetConfig:
         engine: "chain", batched in JAX, the fastest, which can simulate every effect; "mjx", batched too; or
             "threaded", C MuJoCo in threads on the CPU.
         shard_size: trajectories per shard, the unit that one process writes and that a kill can lose.
-        effects: added to every cable after its parameters are drawn, in this order.
+        effects: added to every cable after its parameters are drawn, in this order. A ratio multiplies what was drawn,
+            and so does the coefficient of `table_friction`, as a ratio to the nominal one.
         posterior: sets of effects, equally probable; after `effects`, trajectory i gets the one of number i modulo
             their number. See `cablejax.effects.verdicts.posterior_of_verdict`.
     """

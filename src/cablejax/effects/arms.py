@@ -91,15 +91,15 @@ def lag_weights(ratio: Any) -> tuple[Any, Any, Any]:
     """Weights of one interval of a first-order lag: `y_1 = d y_0 + w_0 u_0 + w_1 u_1`.
 
     Exact for input that is linear over the interval dt: `slow y' + y = u` gives `d = exp(-dt / slow)`,
-    `w_0 = r - d - d r` and `w_1 = 1 - r + d r` with `r = slow / dt`.
+    `w_0 = r (1 - d) - d` and `w_1 = 1 - r (1 - d)` with `r = slow / dt`.
 
     Args:
         ratio: r >= 0, a NumPy or JAX number; 0 = no lag, to the last bit.
     """
     xp = ratio.__array_namespace__()
     # below a thousandth of an interval nothing is left of the past
-    decay = xp.exp(-1.0 / xp.maximum(ratio, 1e-3))
-    return decay, ratio - decay - decay * ratio, 1 - ratio + decay * ratio
+    fresh = -xp.expm1(-1.0 / xp.maximum(ratio, 1e-3))
+    return 1 - fresh, ratio * fresh - (1 - fresh), 1 - ratio * fresh
 
 
 def executed_twist(physics: Physics, start: Any, twist: Any, interval: Any) -> Any:
@@ -130,8 +130,10 @@ def lagged(poses: Any, interval: Any, delay: Any, slow: Any) -> Any:
     xp, late = poses.__array_namespace__(), delayed(poses, delay / interval)
     ratio = xp.asarray(slow, dtype=poses.dtype) / interval
     decay, before_weight, after_weight = lag_weights(ratio)
-    driven = before_weight * late[:-1] + after_weight * late[1:]
-    return xp.concatenate([late[:1], _recursion(xp, decay, late[0], driven)])
+    # from the first pose on: what rounding leaves of it would be lost anew with every sample
+    moved = late - late[:1]
+    driven = before_weight * moved[:-1] + after_weight * moved[1:]
+    return late + (xp.concatenate([moved[:1], _recursion(xp, decay, driven)]) - moved)
 
 
 def delayed(values: Any, samples: Any) -> Any:
@@ -147,13 +149,12 @@ def delayed(values: Any, samples: Any) -> Any:
     return (1 - t) * values[before] + t * values[before + 1]
 
 
-def _recursion(xp: Any, decay: Any, first: Any, driven: Any) -> Any:
-    """`y_k = decay y_(k - 1) + driven_k`, from `y_0 = first` on."""
+def _recursion(xp: Any, decay: Any, driven: Any) -> Any:
+    """`y_k = decay y_(k - 1) + driven_k`, from `y_0 = 0` on."""
     if xp is np:
-        result = np.empty_like(driven)
+        result, last = np.empty_like(driven), np.zeros_like(driven[0])
         for k in range(len(driven)):
-            first = result[k] = decay * first + driven[k]
+            last = result[k] = decay * last + driven[k]
         return result
-    begun = driven.at[0].add(decay * first)
-    factors = xp.broadcast_to(decay, begun.shape)
-    return jax.lax.associative_scan(lambda a, b: (a[0] * b[0], b[0] * a[1] + b[1]), (factors, begun))[1]
+    factors = xp.broadcast_to(decay, driven.shape)
+    return jax.lax.associative_scan(lambda a, b: (a[0] * b[0], b[0] * a[1] + b[1]), (factors, driven))[1]

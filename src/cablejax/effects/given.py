@@ -20,6 +20,10 @@ from cablejax.limits import require, shown
 EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRARY, *ARMS)}
 """Every effect by its name in the gap log's format."""
 
+TIMED: frozenset[Hook] = frozenset({"bending", "table", "mass"})
+"""Hooks whose effects may begin and end in the middle of a run of the contact plant: they change numbers of its model,
+not its parts."""
+
 # A value beyond a bound by this share of it is at it.
 _ROUNDED = 1e-5
 # Parameters that say which: a gripper, a keypoint, a direction.
@@ -200,9 +204,14 @@ def check_hooks(
     """
     for effect in effects:
         if not effect.lasting and effect.effect.hook not in changing:
+            if effect.effect.hook in TIMED:
+                advice = "The contact plant can."
+            else:
+                timed = ", ".join(name for name, other in EFFECTS.items() if other.hook in TIMED)
+                advice = f"None can: leave the times out. The contact plant can with {timed}."
             raise ValueError(
                 f"The simulator {simulator} cannot let {effect.name} begin or end in the middle of a run (from_s, "
-                "until_s). The contact plant can, with effects on bending, mass and the table."
+                f"until_s). {advice}"
             )
         if effect.effect.hook not in hooks:
             others = ", ".join(name for name, theirs in able.items() if effect.effect.hook in theirs) or "none"

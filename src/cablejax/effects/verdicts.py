@@ -50,6 +50,12 @@ def posterior_of_verdict(path: str | os.PathLike[str]) -> tuple[tuple[GivenEffec
     Raises:
         ValueError: as `effects_of_verdict`.
     """
+    named, *drawn = explanations_of_verdict(path)
+    return tuple(drawn) or (named,)
+
+
+def explanations_of_verdict(path: str | os.PathLike[str]) -> tuple[tuple[GivenEffect, ...], ...]:
+    """The effects that a verdict names, then the draws of its posterior if it has any; see `posterior_of_verdict`."""
     verdict = read_verdict_json(path)
     named, posterior = _named(verdict, path), verdict.get("posterior") or []
     try:
@@ -60,10 +66,10 @@ def posterior_of_verdict(path: str | os.PathLike[str]) -> tuple[tuple[GivenEffec
         raise ValueError(f"{path}: posterior is not of the verdict's format ({error}).") from error
     place = verdict.get("place_m")
     if place is None:
-        return drawn or (named,)
+        return (named, *drawn)
     if not (isinstance(place, list) and len(place) == 2 and all(value in LIMITS["origin"] for value in place)):
         raise ValueError(f"{path}: place_m is {shown(place)}, expected x and y in metres, {LIMITS['origin']}.")
-    return tuple(tuple(_about(effect, place) for effect in one) for one in drawn or (named,))
+    return tuple(tuple(_about(effect, place) for effect in one) for one in (named, *drawn))
 
 
 def read_verdict_json(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -40,13 +40,15 @@ class Cables:
         self._recipe = config.recipe(config.effects)
         self._targets = [config.target(target) for target in config.targets]
         pose = straight_start(config.cable)
-        self._start = self._engine.initial_state(pose[None])
-        self._shown = self._at_rest(*self._resting())
+        self._laid = self._engine.initial_state(pose[None])
+        drawn = cable_params(self._recipe, draw_parameters(self._recipe, np.random.default_rng(0)))
+        one = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[None], drawn)
+        self._start, self._shown = self._at_rest(one)
 
         def rows(leaf):
             return np.repeat(np.asarray(leaf), size, axis=0)
 
-        self._physics, self._state = jax.tree.map(rows, self._resting())
+        self._physics, self._state = jax.tree.map(rows, (one, self._start))
         points = config.cable.n_keypoints
         self.keypoints, self.target = np.zeros((2, size, points, 2), np.float32)
         self.gripper_pose = rows(np.asarray(pose, np.float32)[None])
@@ -54,8 +56,13 @@ class Cables:
         self.executed = np.zeros((size, 2, 3), np.float32)
         self.names = [""] * size
 
-    def _at_rest(self, physics: Physics, start: CableState) -> Float[np.ndarray, "2 N 2"]:
-        """True and seen keypoints of one cable before its first action [m]; raises ValueError if it diverges there."""
+    def _at_rest(self, physics: Physics) -> tuple[CableState, Float[np.ndarray, "2 N 2"]]:
+        """One cable before its first action: its state, its true and its seen keypoints [m].
+
+        Raises:
+            ValueError: it diverges there.
+        """
+        start = self._engine.settled(physics, self._laid)
         rest = self._engine.rollout(physics, start, np.zeros((1, 1, 2, 3)))[1]
         if not np.isfinite(rest.keypoints).all():
             raise ValueError(
@@ -64,11 +71,7 @@ class Cables:
                 "links (n_links)."
             )
         true = self._engine.keypoints(without_bias(physics), start)
-        return np.stack([np.asarray(true[0]), np.asarray(rest.keypoints[0, 0])])
-
-    def _resting(self):
-        one = cable_params(self._recipe, draw_parameters(self._recipe, np.random.default_rng(0)))
-        return jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[None], one), self._start
+        return start, np.stack([np.asarray(true[0]), np.asarray(rest.keypoints[0, 0])])
 
     def reset(
         self,
@@ -95,7 +98,8 @@ class Cables:
         recipe = self._recipe if effects is None else config.recipe(effects)
         physics = cable_params(recipe, draw_parameters(recipe, random))
         batch = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[None], physics)
-        shown = self._shown if effects is None else self._at_rest(batch, self._start)
+        # without effects all cables lie alike, whatever their parameters
+        start, shown = self._at_rest(batch) if recipe.effects else (self._start, self._shown)
 
         def put(whole, leaf):
             whole[row] = leaf
@@ -104,9 +108,9 @@ class Cables:
         # what a simulation returned is read-only: it is copied once, not for every cable that is reset after it
         self._state = jax.tree.map(lambda leaf: np.require(leaf, requirements="W"), self._state)
         jax.tree.map(put, self._physics, physics)
-        jax.tree.map(lambda whole, leaf: put(whole, leaf[0]), self._state, self._start)
+        jax.tree.map(lambda whole, leaf: put(whole, leaf[0]), self._state, start)
         self.target[row], self.names[row] = chosen.keypoints, chosen.name
-        self.gripper_pose[row] = np.asarray(self._start.gripper_pose[0])
+        self.gripper_pose[row] = np.asarray(start.gripper_pose[0])
         self.taken[row], self.executed[row] = 0, 0.0
         only = np.arange(len(self.taken)) == row
         true, seen = np.repeat(shown[:, None], len(only), axis=1)
@@ -143,7 +147,7 @@ class Cables:
             lambda new, old: np.where(torn.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, self._state
         )
         self.taken += active
-        self.executed = np.where(torn[:, None, None], 0.0, twists / config.scale).astype(np.float32)
+        self.executed = np.where((torn | diverged)[:, None, None], 0.0, twists / config.scale).astype(np.float32)
         seen = active & ~diverged & ~torn
         self.gripper_pose[seen] = poses[seen]
         self._observe(seen, keypoints, np.asarray(shown.keypoints[:, -1]), randoms)

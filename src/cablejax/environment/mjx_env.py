@@ -71,7 +71,7 @@ class MjxShapeCable:
         spread = np.log([limits or (1.0, 1.0) for limits in (ranges.stiffness, ranges.friction, ranges.damping)])
         self._nominal, self._spread = nominal, spread.astype(np.float32).T
         self._targets = np.stack([config.target(target).keypoints for target in config.targets]).astype(np.float32)
-        self._start = self._engine.initial_state(straight_start(config.cable))
+        self._laid = self._engine.initial_state(straight_start(config.cable))
         self._obstacle = may_touch(cable_params(self._recipe, nominal))
 
     def reset(self, rng: Array) -> State:
@@ -81,7 +81,9 @@ class MjxShapeCable:
         factors = jnp.exp(jax.random.uniform(parameters, (3,), minval=low, maxval=high))
         physics = jax.tree.map(jnp.asarray, cable_params(self._recipe, self._nominal * factors))
         target = jnp.asarray(self._targets)[jax.random.randint(choice, (), 0, len(self._targets))]
-        start, zero = self._start, jnp.zeros(())
+        start, zero = self._laid, jnp.zeros(())
+        if self._recipe.effects:
+            start = self._engine.settled(self._known(physics), start, self.config.interval)
         true = self._engine.keypoints(without_bias(physics), start)
         seen, _ = self._moved(physics, start, jnp.zeros((2, 3)))[1]
         rng, obs, error = self._observed(rng, true, seen, start, target)
@@ -158,10 +160,12 @@ class MjxShapeCable:
         """This environment."""
         return self
 
+    def _known(self, physics: Physics) -> Physics:
+        return physics if self._obstacle else without_obstacle(physics)
+
     def _moved(self, physics: Physics, data: CableState, twist: Float[Array, "2 3"]):
         """The cable after a twist, and its keypoints as they are seen before and after, shape [2, N, 2]."""
-        known = physics if self._obstacle else without_obstacle(physics)
-        data, shown = self._engine.unroll(known, data, twist[None], self.config.interval)
+        data, shown = self._engine.unroll(self._known(physics), data, twist[None], self.config.interval)
         return data, shown.keypoints
 
     def _observed(self, rng: Array, true: Array, keypoints: Array, data: CableState, target: Array):

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.ndimage import convolve
 
 from cablejax.cable import Discretisation
-from cablejax.limits import check
+from cablejax.limits import check, require, shown
 from cablejax.simulate.composite import link_lengths, node_offsets
 
 CENTRE_DEPTH = np.pi / 4
@@ -67,7 +67,17 @@ class CameraConfig:
             range_noise="noise",
             dropout="probability",
             outliers="probability",
+            azimuth="finite",
+            gripper_overlap="not_negative",
         )
+        for x in self.centre:
+            require(x, "origin", "CameraConfig.centre")
+        for box in self.occluders:
+            if len(box) != 6 or not np.isfinite(box).all() or min(box[3:]) <= 0:
+                raise ValueError(
+                    f"CameraConfig.occluders has {shown(box)}, expected (x, y, z, half x, half y, half z), finite and "
+                    "with positive halves, in metres."
+                )
         if not 0 <= self.min_neighbours <= 8:
             raise ValueError(
                 f"CameraConfig.min_neighbours is {self.min_neighbours}, expected 0 to 8, a pixel's neighbours."

@@ -8,13 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable
-from cablejax.effects.given import check_hooks
+from cablejax.effects.given import TIMED, check_hooks
 from cablejax.perceive.camera import CameraConfig, DepthCamera
 from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState
 from cablejax.perceive.registration import RegistrationConfig
 from cablejax.perceive.tracker import Tracker
 from cablejax.simulate.plant import HOOKS, Plant, PlantConfig
-from cablejax.simulate.plant.config import CHANGING
 from cablejax.simulate.table_plant import Observation
 
 
@@ -41,7 +40,12 @@ class CloudPlant(Plant):
     ):
         super().__init__(config)
         # its keypoints come from a cloud, not from what a camera reports
-        check_hooks(self.config.effects, HOOKS - {"observation"}, "CloudPlant", {"Plant": HOOKS}, CHANGING)
+        check_hooks(self.config.effects, HOOKS - {"observation"}, "CloudPlant", {"Plant": HOOKS}, TIMED)
+        if ignored := [name for name in ("keypoint_noise", "keypoint_dropout") if getattr(self.config, name)]:
+            raise ValueError(
+                f"CloudPlant has no use for {' and '.join(ignored)}: its keypoints are estimated from clouds, whose "
+                "noise and gaps are the camera's, `CameraConfig`."
+            )
         cable = self.config.cable
         self.camera = DepthCamera(CameraConfig() if camera is None else camera, self.config.discretisation)
         self.tracker = Tracker(tracker_for(cable) if tracker is None else tracker)

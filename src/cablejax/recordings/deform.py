@@ -172,7 +172,8 @@ def _group(blocks: list[np.ndarray], numbers: list[int]) -> np.ndarray:
     recording = np.zeros(len(blocks), int)
     for index in range(1, len(blocks)):
         step = np.linalg.norm(blocks[index][0] - blocks[index - 1][-1], axis=-1)
-        follows = numbers[index] == numbers[index - 1] + 1 and np.nanmax(step, initial=0.0) < ADJOINING
+        seen = step[np.isfinite(step)]
+        follows = numbers[index] == numbers[index - 1] + 1 and seen.size > 0 and seen.max() < ADJOINING
         recording[index] = recording[index - 1] + (not follows)
     return recording
 

@@ -123,7 +123,7 @@ def solve_elastica(
         )
 
     if guess is not None:
-        solution = _solve(ends, *_from_points(np.asarray(guess, float), length, direction))
+        solution = _solve(ends, *_from_points(np.asarray(guess, float), direction))
         if solution is None:
             raise ElasticaError("No equilibrium near the given guess: pass a guess closer to the wanted shape.")
         return placed(solution)
@@ -232,7 +232,7 @@ def _from_angle(s, angle, curvature):
     return np.stack([x, y, angle, curvature])
 
 
-def _from_points(points, length, direction):
+def _from_points(points, direction):
     """Mesh, state and force of a guess given as points uniform in arc length."""
     edges = np.diff(points, axis=0)
     middle = (np.arange(len(edges)) + 0.5) / len(edges)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
+import math
 import warnings
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -27,6 +28,8 @@ _FINE_SAMPLE = 0.1
 _TAUT = 1e-4
 """Grippers are that near to the cable's length, relative to it, where it is taut."""
 _LAGS = ("actuation_time", "actuation_delay", "camera_lag")
+_SETTLING = 3.0
+"""For how long a new cable lies between resting grippers before it counts as settled [s]."""
 
 
 class Engine(abc.ABC):
@@ -87,6 +90,25 @@ class Engine(abc.ABC):
             The final state and the trajectory of T + 1 samples.
         """
 
+    def settled(self, physics: Physics, state: CableState, interval: float = 1.0) -> CableState:
+        """A cable that was laid out as in `state`, once it lies as its effects and the table's friction leave it.
+
+        `initial_state` is that of the nominal cable: without this, the first command would carry the jump to the shape
+        in which a cable of another rest curvature, or in clamps that are askew, lies.
+
+        Args:
+            physics: as of `rollout`. Nothing slips and no arm moves before the first command.
+            state: where the cable is laid.
+            interval: any duration of commands [s], a multiple of the time step.
+        """
+        count = math.ceil(_SETTLING / interval)
+        # NumPy: known to be zero, also where a caller traces the physics
+        idle = {name: np.zeros(np.shape(getattr(physics, name)), np.float32) for name in ("slip", *_LAGS)}
+        still = np.zeros((*state.gripper_pose.shape[:-2], count, 2, 3 if self.config.dimension == 2 else 6))
+        rested = self.rollout(dataclasses.replace(physics, **idle), state, still, interval)[0]
+        memory = None if rested.memory is None else dataclasses.replace(rested.memory, time=0.0 * rested.memory.time)
+        return dataclasses.replace(rested, qvel=jnp.zeros_like(rested.qvel), memory=memory)
+
     def substeps(self, interval: float) -> int:
         """See `Discretisation.steps_in`."""
         return self.config.steps_in(interval)
@@ -128,19 +150,21 @@ def finely_sampled(
 def _warn_if_taut(engine: Engine, physics: Physics, state: CableState, twist: Any, interval: float) -> None:
     """Warns where the grippers are commanded further apart than the cable is long, unless it can stretch or slip."""
     # under `jax.grad` and the like the values are known all the same
-    inputs = jax.lax.stop_gradient((state.gripper_pose, twist, physics.axial_compliance, physics.slip))
-    if any(isinstance(x, jax.core.Tracer) for x in inputs) or any(np.any(np.asarray(x) != 0) for x in inputs[2:]):
+    inputs = jax.lax.stop_gradient(
+        (state.gripper_pose, twist, physics.actuation_gain, physics.axial_compliance, physics.slip)
+    )
+    if any(isinstance(x, jax.core.Tracer) for x in inputs) or any(np.any(np.asarray(x) != 0) for x in inputs[3:]):
         return
     pose, moved = (np.asarray(x)[..., :3] for x in inputs[:2])
     if not moved.size:
         return
-    chord = (pose[..., 1, :] - pose[..., 0, :])[..., None, :] + interval * np.cumsum(
-        moved[..., 1, :] - moved[..., 0, :], axis=-2
-    )
+    apart = np.cumsum(moved[..., 1, :] - moved[..., 0, :], axis=-2)
+    gain = np.asarray(inputs[2])[..., None, None]
+    chord = (pose[..., 1, :] - pose[..., 0, :])[..., None, :] + interval * gain * apart
     reach = np.linalg.norm(chord[..., : engine.config.dimension], axis=-1).max()
     if reach > engine.config.cable.length * (1 - _TAUT):
         warnings.warn(
-            f"The grippers are commanded {reach:.4f} m apart but the cable is {engine.config.cable.length:g} m long: "
+            f"The grippers are driven {reach:.4f} m apart but the cable is {engine.config.cable.length:g} m long: "
             "it is taut, or its ends leave the grippers, so its motion and derivatives are meaningless. Bring the "
             "grippers closer.",
             stacklevel=4,

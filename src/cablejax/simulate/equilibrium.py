@@ -1,7 +1,8 @@
 """Static equilibrium of the planar chain with both ends clamped, without friction.
 
-Minimises the bending energy `sum_i EI/(2h) (phi_i - h kappa_0i)^2` over the joint angles phi, subject to the far end's
-position and tangent, by Newton's method in the null space of the constraints. Negative curvature is reflected, so that
+Minimises the bending energy `sum_i phi_i^2` of a uniform cable over the joint angles phi, subject to the far end's
+position and tangent, by Newton's method in the null space of the constraints. A rest curvature that is the same
+everywhere does not change the minima, because the clamps fix the whole turn. Negative curvature is reflected, so that
 the iteration ends in a minimum, a shape in which a real cable would rest. Only from a guess with a symmetry that no
 minimum has may it end in a saddle: `Equilibrium.stability` is below 0 there.
 """
@@ -96,10 +97,11 @@ def _taut(config: Discretisation, pose: Float[np.ndarray, "2 3"]) -> Equilibrium
     """The only shape of a cable as long as the grippers are apart: straight."""
     chord = pose[1, :2] - pose[0, :2]
     off = np.abs(wrapped(pose[:, 2] - np.arctan2(chord[1], chord[0]))).max()
-    if off > 1e-6 or abs(pose[1, 2] - pose[0, 2]) > 1e-6:
+    turned = max(off, abs(pose[1, 2] - pose[0, 2]))
+    if turned > 1e-6:
         raise ValueError(
-            f"The grippers are a whole cable length apart, but turned by {off:.3g} rad from the line between them: a "
-            "taut cable can only be straight. Bring them closer, or align them."
+            f"The grippers are a whole cable length apart, but turned by {turned:.3g} rad from the line between them "
+            "or against each other: a taut cable can only be straight. Bring them closer, or align them."
         )
     return Equilibrium(angles=np.zeros(config.n_joints), stability=np.inf)
 
@@ -160,7 +162,13 @@ def equilibrium_state(config: Discretisation, gripper_pose, *, guess=None) -> Ca
         raise ValueError(f"gripper_pose has shape {pose.shape}, expected (..., 2, {width}).")
     batch = pose.shape[:-2]
     flat = pose.reshape(-1, 2, width)
-    guesses = [None] * len(flat) if guess is None else np.asarray(guess).reshape(len(flat), -1, config.dimension)
+    guesses = [None] * len(flat)
+    if guess is not None:
+        shape = np.shape(guess)
+        if len(shape) != len(batch) + 2 or shape[:-2] != batch or shape[-1] != config.dimension:
+            expected = ", ".join(map(str, (*batch, "N", config.dimension)))
+            raise ValueError(f"guess has shape {shape}, expected ({expected}): keypoints for each pair of grippers.")
+        guesses = np.asarray(guess).reshape(len(flat), *shape[-2:])
     solve = _planar_qpos if config.dimension == 2 else _spatial_qpos
     qpos = np.stack([solve(config, p, g) for p, g in zip(flat, guesses, strict=True)])
     nv = config.n_joints + 3 if config.dimension == 2 else 3 * config.n_joints + 6

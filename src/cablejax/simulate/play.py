@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -127,7 +128,7 @@ def played(
 
 def settled(twist: Float[np.ndarray, "T 2 3"], interval: float) -> Bool[np.ndarray, "T"]:
     """Samples before which both grippers have rested for `SETTLING`, and those until they first move."""
-    index, samples = np.arange(len(twist)), round(SETTLING / interval)
+    index, samples = np.arange(len(twist)), math.ceil(SETTLING / interval - 1e-9)
     moved = np.append(False, np.abs(twist[:-1]).max(axis=(1, 2)) > 1e-9)
     return index - np.maximum.accumulate(np.where(moved, index, -samples)) >= samples
 

@@ -55,10 +55,10 @@ def caveats(
         fitted = found.everything.explanation.own
         # of a recording whose windows are all too short for a fit there is none
         grips = GRIP * np.array([fitted[group] for group in np.unique(windows.group) if group < len(fitted)])
+        size = f"{np.sqrt((grips**2).mean()):.2f} rad (root mean square) from the mean."
+        unseen = " Recordings that no fit has seen are predicted with the mean." if windows.group.max() > 0 else ""
         result.append(
-            "The angle of the cable in the grippers is fitted for each recording: it differs by "
-            f"{np.sqrt((grips**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen "
-            "are predicted with the mean."
+            f"The angle of the cable in the grippers is fitted for each recording: it differs by {size}{unseen}"
         )
     if compared_s is not None:
         result.append(

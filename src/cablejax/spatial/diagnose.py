@@ -53,8 +53,8 @@ def diagnose_space(
 ) -> SpatialDiagnosis:
     """Diagnoses a log of a cable that hangs between two grippers and moves.
 
-    Episodes whose `split` is "eval" are left untouched. Everything is reported per mass, since the motion of a hanging
-    cable does not depend on its weight.
+    Episodes whose `split` is "eval" are neither fitted nor scored; how the cable is held, the clock and the noise are
+    of all. Everything is reported per mass, since the motion of a hanging cable does not depend on its weight.
 
     Args:
         log: in space.
@@ -85,6 +85,7 @@ def diagnose_space(
     cut = _seconds(says.compared.windows) if says.compared.windows.valid.sum() < counted.valid.sum() else None
     sentence = verdict_sentence(says.verdict, says.effects, says.equivalent, says.share)
     offset = ParameterEstimate(constant_offset(after, counted), None, "m")
+    where = where_of(log, counted, says.before[says.use], noise, says.smallest, changes)
     nominal, explained = (in_log(log, windows, part) for part in (says.before, says.after))
     return SpatialDiagnosis(
         verdict=says.verdict,
@@ -94,7 +95,7 @@ def diagnose_space(
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
         ranking=_ranking(found),
         gap=says.gap,
-        where=where_of(log, counted, nominal, says.before[says.use], noise, says.smallest, changes),
+        where=where,
         caveats=(
             *repairs,
             *resampled,

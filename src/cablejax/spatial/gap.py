@@ -177,7 +177,6 @@ def in_log(log: GapLog, windows: Windows, predicted: Float[np.ndarray, "W T F 3"
 def where_of(
     log: GapLog,
     windows: Windows,
-    nominal: Float[np.ndarray, "E T N 3"],
     before: Float[np.ndarray, "W T F 3"],
     noise: float,
     smallest: float,
@@ -187,13 +186,13 @@ def where_of(
 
     Args:
         log: in space.
-        windows: of the log.
-        nominal: predictions of the nominal simulator at the log's samples [m].
-        before: the same of the windows [m].
+        windows: of the log, those that count.
+        before: predictions of the nominal simulator in them [m].
         noise: standard deviation of a coordinate [m].
         smallest: error from which on there is a gap [m], see `smallest_gap`.
         changes: of the set-up between recordings, in words.
     """
+    nominal = in_log(log, windows, before)
     off = bounded(np.asarray(log.keypoints, float) - nominal) ** 2
     off = np.where(np.isfinite(log.keypoints) & np.isfinite(nominal), off, np.nan)
     squared = squares(before, windows)

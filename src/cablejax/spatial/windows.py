@@ -257,8 +257,8 @@ def _no_window(longest: int, least: int, interval: float) -> str:
         long = f"{(longest - 1) * interval:.3g} s long, expected at least {SHORTEST:g} s"
         return f"The longest episode is {long}. Record longer motions."
     return (
-        f"No episode has a stretch of {SHORTEST:g} s whose first two samples show all keypoints, or miss them for at "
-        f"most {FILLED:g} s. Record with more cameras, or leave out the keypoints that are seen least."
+        f"No episode has two samples in a row that show all keypoints, or miss them for at most {FILLED:g} s, and then "
+        f"{SHORTEST:g} s more. Record with more cameras, or leave out the keypoints that are seen least."
     )
 
 

@@ -7,16 +7,13 @@ from typing import get_args
 
 from cablejax.cable import Discretisation
 from cablejax.effects import Hook
-from cablejax.effects.given import GivenEffect
+from cablejax.effects.given import TIMED, GivenEffect
 from cablejax.effects.physics import Physics
 from cablejax.limits import check
 from cablejax.simulate.plant_config import ObservedConfig, check_camera, check_effects, plant_physics
 
 HOOKS: frozenset[Hook] = frozenset(get_args(Hook))
 """Hooks of the effects that the contact plant can stage."""
-
-CHANGING: frozenset[Hook] = frozenset({"bending", "table", "mass"})
-"""Those whose effects may begin and end in the middle of a run: they change numbers of the model, not its parts."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +55,7 @@ class PlantConfig(ObservedConfig):
         check(self, "seed", settle_time="positive")
         check_camera(self)
         object.__setattr__(self, "effects", tuple(self.effects))
-        check_effects(self, HOOKS, {}, CHANGING)
+        check_effects(self, HOOKS, {}, TIMED)
         remembered = [effect.name for effect in self.effects if effect.effect.hook == "memory"]
         if remembered and not all(effect.lasting for effect in self.effects):
             raise ValueError(

@@ -98,9 +98,7 @@ class DiscreteRod:
             turn_matrix=twist_matrix(physics, curve, h, n),
         )
 
-    def forces(
-        self, nodes: Float[Array, "n 3"], directors: Float[Array, "m 3"], tangents: Float[Array, "m 3"]
-    ) -> Float[Array, "f 3"]:
+    def forces(self, directors: Float[Array, "m 3"], tangents: Float[Array, "m 3"]) -> Float[Array, "f 3"]:
         """Forces of rest curvature and twist at the free nodes, per mass [m/s^2]."""
         h = self.h
         a, b = joint_frames(tangents, directors)

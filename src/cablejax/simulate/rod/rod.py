@@ -179,7 +179,7 @@ class Rod:
         offsets, forces = jnp.zeros_like(seen[0]), 0.0
         if self.twisting:
             frames = discrete.first_frames(start, side[0])
-            offsets, forces = discrete.marker_offsets(*frames), discrete.forces(start, *frames)
+            offsets, forces = discrete.marker_offsets(*frames), discrete.forces(*frames)
             start, again = discrete.through(seen[0] - offsets, held[0], start[2:-2], forces)
             found &= again
         second, also = discrete.through(seen[1] - offsets, held[1], start[2:-2], forces)

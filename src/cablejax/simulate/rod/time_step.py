@@ -96,7 +96,7 @@ def time_step(
         mass * inertia[2:-2] + drag * known[2:-2] + spread_bends(uncoupled - resisted) + coupled[1:-2] - coupled[2:-1]
     )
     if twisting:
-        force = force + discrete.forces(x_next, transport(u, t, unit(edges)), unit(edges))
+        force = force + discrete.forces(transport(u, t, unit(edges)), unit(edges))
     pins = jnp.zeros((0, discrete.n - 4))
     if markers is not None:
         offsets = discrete.marker_offsets(u, t) if twisting else 0.0
