@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from cablejax.bounded import BatchedGaussNewton, Linearised, Result, solve_arrow
+from cablejax.bounded import BatchedGaussNewton, QuadraticModel, Result, solve_arrow
 
 SOLVER = BatchedGaussNewton(tolerance=1e-14, max_steps=300)
 
@@ -38,7 +38,7 @@ PROBLEMS = {
 def linearised(problem, y):
     fn, _, lower, upper = problem
     r, jacobian = fn(np.asarray(y))
-    return Linearised(
+    return QuadraticModel(
         point=np.asarray(y, float),
         lower=np.array(lower),
         upper=np.array(upper),
@@ -122,7 +122,7 @@ def test_the_steps_are_limited_and_a_loose_tolerance_saves_them():
 
 
 def test_nothing_to_move_has_converged():
-    empty = Linearised(np.zeros(0), np.zeros(0), np.zeros(0), 1.0, np.zeros(0), np.zeros((0, 0)), None)
+    empty = QuadraticModel(np.zeros(0), np.zeros(0), np.zeros(0), 1.0, np.zeros(0), np.zeros((0, 0)), None)
     (ended,) = SOLVER.minimise([empty], lambda trials: pytest.fail("evaluated"))
     assert ended.result is Result.CONVERGED and ended.evaluations == 0
 
@@ -157,7 +157,7 @@ def test_blocks_change_no_step_though_some_of_their_coordinates_are_at_a_bound()
             off = point - middle
             value, gradient = 0.5 * float(off @ matrix @ off) + 0.25 * float((off**4).sum()), matrix @ off + off**3
             curvature = matrix + np.diag(3 * off**2)
-            return Linearised(
+            return QuadraticModel(
                 point, np.full(len(off), -0.3), np.full(len(off), 0.5), value, gradient, curvature, None, blocks
             )
 
@@ -178,7 +178,7 @@ def test_a_problem_whose_steps_are_rejected_is_stalled_and_not_converged():
 
     def linearise(points):
         return [
-            Linearised(
+            QuadraticModel(
                 y, np.full(1, -9.0), np.full(1, 9.0), 0.5 * float(r @ r), jacobian.T @ r, jacobian.T @ jacobian, None
             )
             for y in points.values()
@@ -198,8 +198,18 @@ def test_a_start_in_a_valley_goes_along_it():
     def linearise(points):
         wide = np.full(2, 99.0)
         return [
-            Linearised(y, -wide, wide, 0.5 * float(y @ matrix @ y), matrix @ y, matrix, None) for y in points.values()
+            QuadraticModel(y, -wide, wide, 0.5 * float(y @ matrix @ y), matrix @ y, matrix, None)
+            for y in points.values()
         ]
 
     (end,) = BatchedGaussNewton(tolerance=0.02, max_steps=8).minimise(linearise({0: turn @ [0.0, 3.0]}), linearise)
     assert end.result is Result.CONVERGED and end.best.value < 0.02
+
+
+def test_a_start_outside_of_its_bounds_is_refused():
+    """A coordinate beyond a bound that the descent would leave counted as converged."""
+    start = QuadraticModel(
+        np.array([2.0]), np.array([-9.0]), np.array([1.0]), 0.5, np.array([-1.0]), np.eye(1), kept=None
+    )
+    with pytest.raises(ValueError, match=r"Problem 0 begins at 2 in coordinate 0, expected -9 to 1"):
+        SOLVER.minimise([start], lambda trials: [])

@@ -245,6 +245,39 @@ def test_outside_compiled_code_failures_are_raised_with_what_to_do():
         assert all(result.message for result in Result)
 
 
+@pytest.mark.parametrize("name", SOLVERS)
+def test_whole_numbers_are_points_too(name):
+    box = Box(jnp.array([0, 0]), jnp.array([3, 3]))
+    solution = least_squares(lambda y, _: y - 0.7, SOLVERS[name], jnp.array([0, 2]), box)
+    np.testing.assert_allclose(solution.value, 0.7, atol=1e-6)
+
+
+def test_balls_about_whole_numbers():
+    np.testing.assert_allclose(Balls(jnp.asarray(0.5)).project(jnp.array([[3, 4]])), [[0.3, 0.4]])
+
+
+def test_a_start_without_a_value_has_no_optimality():
+    start = jnp.array([0.5, 0.5])
+    for solver in (SOLVERS["quasi-Newton"], SpectralProjectedGradient()):
+        solution = minimise(lambda y, _: jnp.sum(y) * jnp.nan, solver, start, Box(*map(jnp.asarray, UNIT)), throw=False)
+        assert Result(int(solution.result)) is Result.NONFINITE and not float(solution.optimality) < 1e-3
+
+
+def test_projected_gradient_points_break_no_bound_by_rounding():
+    """The function has no value there: y + (P(y - g) - y) is not P(y - g)."""
+    upper = jnp.array([-0.9, -0.3, -0.7])
+    box = Box(jnp.full(3, -jnp.inf), upper)
+    seen = []
+
+    def fn(y, _):
+        jax.debug.callback(lambda excess: seen.append(float(excess)), (y - upper).max())
+        return -jnp.sum(y)
+
+    minimise(fn, SpectralProjectedGradient(), jnp.array([-2.0, -3.1, -4.3]), box)
+    jax.effects_barrier()
+    assert len(seen) > 1 and max(seen) <= 0.0
+
+
 @pytest.mark.parametrize(
     ("start", "options", "message"),
     [

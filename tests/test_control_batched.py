@@ -202,5 +202,9 @@ def test_wrong_requests_are_refused():
         shape_batch(engine, params, state, controller, shapes("U"), 1)
     with pytest.raises(ValueError, match="multiple of the time step"):
         shape_batch(engine, params, state, controller, shapes("UU"), 1, interval=0.015)
+    unknown = shapes("UU")
+    unknown[0, 2] = np.nan
+    with pytest.raises(ValueError, match=r"target has shape .* with non-finite values"):
+        shape_batch(engine, params, state, controller, unknown, 1)
     with pytest.raises(ValueError, match="steps is 0"):
         shape_batch(engine, params, state, controller, shapes("UU"), 0)

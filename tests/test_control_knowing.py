@@ -140,7 +140,7 @@ def test_a_conditioned_model_begins_with_what_it_is_informed_of():
     np.testing.assert_allclose(informed.believed, np.log([0.5, 2.0]), rtol=1e-5)
     mpc = make_controller(informed, make_target("U", informed.cable), method="direct", solver="levenberg-marquardt")
     assert mpc.config.adaptation is not None and mpc.config.adaptation.prior_mean == informed.believed
-    # only the ratio of both matters in slow motion: what is beyond the bound of one is taken up by the other
+    # only the ratio of both matters in slow motion: what is beyond the bound of friction is taken up by stiffness
     far = knowing(conditioned, (parse_effect("linear_density:ratio=8"),))
     np.testing.assert_allclose(far.believed[1] - far.believed[0], np.log(8.0), rtol=1e-5)
     assert far.believed[1] == mpc.config.adaptation.limits[1][1]

@@ -220,6 +220,40 @@ def test_nothing_observed_at_all_keeps_going_on_predictions():
     assert not state.learner.window.valid.any()
 
 
+def test_what_was_not_observed_is_no_evidence_that_the_model_is_right():
+    """The prediction stands for the cable, so the error falls as predicted: the radius grew, and was the best seen."""
+    control, cable = controller(), Cable(rate=0.8, sag=0.0)
+    state = control.init(at_rest(START))
+    for _ in range(2):
+        state, twist, _ = control.step(state, Measurement(cable.keypoints, cable.pose))
+        cable.step(twist)
+    state = dataclasses.replace(state, radius=jnp.asarray(0.01, state.radius.dtype))
+    best, hidden = float(state.progress.best_error), np.full((N, 2), np.nan)
+    for seen in (0, 2, (N + 1) // 2):
+        keypoints = hidden.copy()
+        keypoints[:seen] = cable.keypoints[:seen]
+        after, _, info = control.step(state, Measurement(keypoints, cable.pose))
+        assert float(info.shape_error) < 0.99 * best
+        blind = 2 * seen < N
+        assert float(info.radius) == pytest.approx(0.01 if blind else 0.01 * CONFIG.grow)
+        assert (float(after.progress.best_error) == best) == blind
+
+
+def test_a_twist_that_is_not_known_is_the_commands():
+    control, cable = controller(config=dataclasses.replace(CONFIG, max_change=0.02)), Cable()
+    state = control.init(at_rest(START))
+    state, twist, _ = control.step(state, Measurement(cable.keypoints, cable.pose))
+    cable.step(twist)
+    unknown = np.full((2, 3), np.nan)
+    results = [
+        control.step(state, Measurement(cable.keypoints, pose, known))
+        for pose, known in ((cable.pose, unknown), (cable.pose, None), (unknown, unknown))
+    ]
+    for one, other in zip(*map(jax.tree.leaves, results[:2]), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+    assert int(results[2][-1].result) not in (Result.EMPTY_SET, Result.NONFINITE)
+
+
 @pytest.mark.parametrize("far", [1e20, 3.4e38])
 def test_a_keypoint_without_meaning_counts_as_not_observed(far):
     control, cable = controller(), Cable(rate=0.8, sag=0.0)
@@ -385,7 +419,7 @@ def courses(config, errors, ways_back=()):
     progress = initial_state(config, at_rest(pose)).progress
     for k, error in enumerate(errors):
         ways = jnp.asarray(0.1), jnp.asarray(([0.08] * (len(errors) - len(ways_back)) + [*ways_back])[k])
-        progress = _followed(config, progress, pose, jnp.asarray(error), ways, sound=yes, held=~yes)
+        progress = _followed(config, progress, pose, jnp.asarray(error), ways, seen=yes, sound=yes, held=~yes)
         yield progress
 
 

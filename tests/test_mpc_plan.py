@@ -164,6 +164,18 @@ def test_sampling_knows_the_way_back_from_outside(solver):
     assert Result(int(plan.result)) is Result.EMPTY_SET
 
 
+def test_the_cross_entropy_method_takes_no_plan_without_a_value_for_one_of_the_best():
+    """With fewer of them than elites, plans at which the model gives NaN moved the mean as much as the best."""
+    case = problem("U")
+    broken = dataclasses.replace(
+        case, dynamics=lambda w, h, u: jnp.where(u[0, 0] < 0.03, jnp.nan, 1.0) * case.dynamics(w, h, u)
+    )
+    start = broken.start(jnp.asarray(STILL).at[0, 0, 0].set(0.03 * case.objective.interval))
+    plans = [jax.jit(lambda: CrossEntropy(samples=n, iterations=2)(broken, start))() for n in (8, 64)]  # noqa: B023
+    for plan in plans:
+        assert np.isfinite(plan.motion).all() and int(plan.evaluations) in (16, 128)
+
+
 @pytest.mark.parametrize(("size", "expected"), [(1.5, Result.EMPTY_SET), (1.0, Result.STEP_LIMIT)])
 def test_what_sampling_counts_as_broken_is_relative_to_the_bound(size, expected):
     """A plan a tenth of a millimetre beyond a bound of two tenths, and one on it."""

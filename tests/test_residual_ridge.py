@@ -194,6 +194,10 @@ def test_shapes_that_do_not_belong_together_are_refused():
     delta, twist, valid = window()
     with pytest.raises(ValueError, match=r"expected delta \[W, N, 2\]"):
         fit(delta, twist[1:], valid, RidgeConfig())
+    with pytest.raises(ValueError, match=r"expected delta \[W, N, 2\]"):
+        fit(delta[:, 0, 0], twist, valid, RidgeConfig())
+    with pytest.raises(ValueError, match=r"twist \[W, Q, 3\]"):
+        fit(delta, jnp.concatenate([twist, twist], axis=2), valid, RidgeConfig())
 
 
 def test_corrected_dynamics_is_the_sum_of_both():

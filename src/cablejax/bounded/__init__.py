@@ -7,7 +7,7 @@ travels in their options:
     solution.value, solution.certificate(residuals, Box(lower, upper))
 """
 
-from cablejax.bounded.batched_gauss_newton import BatchedGaussNewton, Linearised, solve_arrow
+from cablejax.bounded.batched_gauss_newton import BatchedGaussNewton, QuadraticModel, solve_arrow
 from cablejax.bounded.certificate import Certificate, certify
 from cablejax.bounded.dogleg import BoundedDogleg
 from cablejax.bounded.gauss_newton import BoundedGaussNewton
@@ -42,7 +42,7 @@ __all__ = [
     "FixedPointAdjoint",
     "Halfspaces",
     "Intersection",
-    "Linearised",
+    "QuadraticModel",
     "Result",
     "Solution",
     "SpectralProjectedGradient",

@@ -20,8 +20,8 @@ from cablejax.bounded.results import Result
 Kept = TypeVar("Kept")
 """What the caller keeps of each linearisation."""
 
-# A coordinate this close to its bound is at it.
-_AT_BOUND = 1e-9
+# A coordinate this close to its bound is at it; one beyond it by the second has not got there by rounding.
+_AT_BOUND, _BEYOND = 1e-9, 1e-6
 
 # Damping begins at the first; an accepted step multiplies it by `_EASED`, a rejected one by `_RAISED`.
 _DAMPING, _EASED, _RAISED = 1e-2, 0.2, 8.0
@@ -30,8 +30,8 @@ _LEAST_DAMPING, _LEAST_RAISED, _MOST_DAMPING = 1e-8, 0.1, 1e3
 
 
 @dataclasses.dataclass(frozen=True)
-class Linearised(Generic[Kept]):
-    """One problem at one point.
+class QuadraticModel(Generic[Kept]):
+    """A quadratic model of one problem about one point.
 
     Attributes:
         point: shape [P]; P may differ between problems.
@@ -72,7 +72,7 @@ class Minimised(Generic[Kept]):
         evaluations: trial points of this problem.
     """
 
-    best: Linearised[Kept]
+    best: QuadraticModel[Kept]
     result: Result
     evaluations: int
 
@@ -96,8 +96,8 @@ class BatchedGaussNewton:
 
     def minimise(
         self,
-        starts: Sequence[Linearised[Kept]],
-        linearise: Callable[[Mapping[int, Float[np.ndarray, "P"]]], Sequence[Linearised[Kept]]],
+        starts: Sequence[QuadraticModel[Kept]],
+        linearise: Callable[[Mapping[int, Float[np.ndarray, "P"]]], Sequence[QuadraticModel[Kept]]],
     ) -> list[Minimised[Kept]]:
         """Minimises all problems.
 
@@ -105,7 +105,18 @@ class BatchedGaussNewton:
             starts: where they begin; a problem without coordinates has converged.
             linearise: problems by their index in `starts` at trial points, all of one step in one call; the results
                 in the mapping's order.
+
+        Raises:
+            ValueError: a start is outside of its bounds.
         """
+        for i, start in enumerate(starts):
+            beyond = np.maximum(start.lower - start.point, start.point - start.upper)
+            if (beyond > _BEYOND).any():
+                k = int(beyond.argmax())
+                raise ValueError(
+                    f"Problem {i} begins at {start.point[k]:.6g} in coordinate {k}, expected {start.lower[k]:.6g} to "
+                    f"{start.upper[k]:.6g}: clip it to its bounds."
+                )
         now, damping, trials_made = list(starts), np.full(len(starts), _DAMPING), np.zeros(len(starts), int)
         results, rejected = [self._at_start(start) for start in starts], np.zeros(len(starts), bool)
         for _ in range(self.max_steps):
@@ -133,14 +144,14 @@ class BatchedGaussNewton:
                     results[i] = Result.STALLED if damping[i] >= _MOST_DAMPING else Result.STEP_LIMIT
         return [Minimised(*ended) for ended in zip(now, results, trials_made.tolist(), strict=True)]
 
-    def _at_start(self, start: Linearised[Kept]) -> Result:
+    def _at_start(self, start: QuadraticModel[Kept]) -> Result:
         """A problem counts as out of steps until it has ended in another way."""
         if not len(start.point):
             return Result.CONVERGED
         known = np.isfinite(start.value) and np.isfinite(start.gradient).all() and np.isfinite(start.curvature).all()
         return Result.STEP_LIMIT if known else Result.NONFINITE
 
-    def _trial(self, at: Linearised[Kept], damping: float) -> Float[np.ndarray, "P"] | None:
+    def _trial(self, at: QuadraticModel[Kept], damping: float) -> Float[np.ndarray, "P"] | None:
         """The next point to try; None where that promises too little."""
         free, step = np.flatnonzero(at.free), np.zeros_like(at.point)
         damped = at.curvature + damping * np.diag(np.diagonal(at.curvature))

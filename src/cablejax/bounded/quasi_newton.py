@@ -156,7 +156,8 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         promised = promised_decrease(info, move)
         rounded = promised <= 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
 
-        optimality = projected_gradient_size(feasible, y, info.grad)
+        # a start without a value has no gradient
+        optimality = jnp.where(state.terminate, jnp.inf, projected_gradient_size(feasible, y, info.grad))
         converged = optimality <= self.atol + self.rtol * self.norm(y)
         # after a step that was taken on trust
         stalled = state.rounded & rounded & ~converged & ~state.terminate

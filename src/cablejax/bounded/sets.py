@@ -133,7 +133,7 @@ class Balls(ConvexSet):
 
     def project(self, y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Shortens every vector that is longer than its radius; in closed form."""
-        return project_ball(y, jnp.asarray(self.radius, y.dtype)[..., None])
+        return project_ball(y, jnp.asarray(self.radius, jnp.result_type(y, float))[..., None])
 
     restore = project
     """The projection is in closed form, and so is this."""

@@ -47,7 +47,7 @@ def minimise(
         The solution, differentiable in `args` and the set where it has converged, see `FixedPointAdjoint`.
 
     Raises:
-        ValueError: the set is empty, or start, set or tolerances are none.
+        ValueError: the set is empty, or start, set or tolerances are not valid.
         RuntimeError: the solve ended in another way than convergence.
     """
     return _solve(optx.minimise, fn, solver, y0, feasible, args, "hessian", hessian, max_steps, throw)
@@ -81,7 +81,7 @@ def least_squares(
         The solution, differentiable in `args` and the set where it has converged, see `FixedPointAdjoint`.
 
     Raises:
-        ValueError: the set is empty, or start, set or tolerances are none.
+        ValueError: the set is empty, or start, set or tolerances are not valid.
         RuntimeError: the solve ended in another way than convergence.
     """
     if isinstance(solver, optx.AbstractMinimiser):
@@ -131,6 +131,7 @@ def _checked(solver, y0, feasible, max_steps: int) -> tuple[Array, Array]:
     if max_steps < 1:
         raise ValueError(f"max_steps is {max_steps}, expected at least 1.")
     y0 = jnp.asarray(y0)
+    y0 = y0 if jnp.issubdtype(y0.dtype, jnp.inexact) else y0.astype(float)
     try:
         return y0, feasible.project(y0)
     except TypeError as error:

@@ -176,9 +176,12 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
 
     def step(self, fn, y, args, options, state: Any, tags):
         """One trial point; keeps the best one so far."""
-        solver = self.within(options["feasible"].at(state.inner.y_eval))
+        feasible = options["feasible"].at(state.inner.y_eval)
+        solver = self.within(feasible)
         # the aux that this returns is that of the step before
         y, inner, _ = super(SpectralProjectedGradient, solver).step(fn, y, args, options, state.inner, tags)
+        # the arc is a difference of points, which rounding may leave outside
+        inner = eqx.tree_at(lambda s: s.y_eval, inner, feasible.restore(inner.y_eval))
         accepted = inner.search_state.shrunk == 0
         better = inner.f_info.f < state.best_value
         state = _SpectralState(

@@ -24,6 +24,7 @@ from cablejax.control.controller import Controller, check_interval, resting
 from cablejax.control.run import shape_error_cm
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.limits import require
+from cablejax.mpc.validation import check_target
 from cablejax.simulate.chain.engine import ChainEngine
 from cablejax.simulate.compile import AXIS, compiler_options, on_devices
 from cablejax.simulate.engine import refuse_lags
@@ -124,7 +125,8 @@ def shape_batch(
 
     Raises:
         ValueError: `steps` is no number of commands, the batch axes differ, the cable is not planar, arms or camera
-            lag, a target has another number of keypoints, or the controller was made for another interval.
+            lag, the controller was made for another interval, or a target has another number of keypoints or is not
+            finite.
     """
     require(steps, "commands", "steps")
     size, chain = len(targets), engine.config
@@ -133,6 +135,7 @@ def shape_batch(
             f"Targets of shape {np.shape(targets)} for a cable with {chain.cable.n_keypoints} keypoints in "
             f"{chain.dimension} dimensions, expected (B, {chain.cable.n_keypoints}, 2) on a planar cable."
         )
+    check_target(np.asarray(targets))
     engine.substeps(interval)
     check_interval(controller, interval)
     refuse_lags(params)

@@ -51,8 +51,8 @@ class CableInputs:
     def with_effects(self, effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, float]:
         """The inputs of a nominal cable with effects, within the limits; the mean where the effects change nothing.
 
-        In slow motion only the ratio of stiffness and friction matters: what is beyond a limit of one is taken up by
-        the other.
+        In slow motion only the ratio of stiffness and friction matters: friction beyond its limits is taken up by the
+        stiffness. Stiffness beyond its own is left out, see `left_out`.
         """
         stiffness, friction = self._asked(effects, cable)
         softest_to_stiffest, smoothest_to_roughest = self.limits

@@ -92,7 +92,10 @@ def run_closed_loop(
         state, reply = link.step(state, observations[-1].time, observations)
         log.add(reply)
         if reply.status in (Status.WAITING, Status.PAUSED):
-            raise ValueError(f"The observations of the plant cannot be used: {reply.refused or reply.reason}")
+            stopped = f"The observations of the plant cannot be used: {reply.refused or reply.reason}"
+            if not log.instants:
+                raise ValueError(stopped)
+            break
         if reply.status.ended:
             stopped = reply.reason if reply.status == Status.STOPPED else None
             break

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from cablejax.bounded import BatchedGaussNewton, Linearised, Result, solve_arrow
+from cablejax.bounded import BatchedGaussNewton, QuadraticModel, Result, solve_arrow
 from cablejax.diagnose.evidence import Evidence, episodes_by_motion, student_log_likelihoods
 from cablejax.diagnose.protocol import Explanation
 
@@ -83,7 +83,7 @@ class Fit:
         shared = np.eye(len(model.point), len(self.explanation.z))
         return np.linalg.inv(solve_arrow(model.curvature, shared, model.blocks)[: shared.shape[1]])
 
-    def model(self, weight: Float[np.ndarray, "E"], cost: float) -> Linearised[Fit]:
+    def model(self, weight: Float[np.ndarray, "E"], cost: float) -> QuadraticModel[Fit]:
         """The quadratic model of a cost in which every episode has a fixed weight.
 
         Its point holds z, then the own numbers of each recording that has episodes here: blocks, which every solution
@@ -95,7 +95,7 @@ class Fit:
         curvature = np.einsum("epq,e->pq", self.curvature[:, :n, :n], weight) + np.eye(n)
         rows, own = np.unique(self.recording), self.explanation.own
         if not len(rows):
-            return Linearised(z, lower, upper, cost, gradient, curvature, self)
+            return QuadraticModel(z, lower, upper, cost, gradient, curvature, self)
         count = own.shape[1]
         blocks = tuple(n + count * k + np.arange(count) for k in range(len(rows)))
         point = np.concatenate([z, own[rows].ravel()])
@@ -109,7 +109,7 @@ class Fit:
             whole[:n, block], whole[block, :n] = curved[:n, n:], curved[n:, :n]
         wide = np.full(len(point) - n, np.inf)
         lower, upper = np.append(lower, -wide), np.append(upper, wide)
-        return Linearised(point, lower, upper, cost, pull, whole, self, blocks)
+        return QuadraticModel(point, lower, upper, cost, pull, whole, self, blocks)
 
     def at(self, point: Float[np.ndarray, "C"]) -> Explanation:
         """The explanation at a point of `model`."""
@@ -242,7 +242,7 @@ def improve(
     tolerance = evidence.simulator.plan.tolerance if tolerance is None else tolerance
     solver = BatchedGaussNewton(tolerance=tolerance, max_steps=max_iterations, largest_step=_LARGEST_STEP)
 
-    def linearised(fit: Fit) -> Linearised[Fit]:
+    def linearised(fit: Fit) -> QuadraticModel[Fit]:
         model = fit.model(evidence.weight(fit.sse), fit.cost(evidence))
         if not own_only:
             return model

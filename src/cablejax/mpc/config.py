@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from typing import Any
 
 from cablejax.adaptation.belief import AdaptationConfig
-from cablejax.limits import check, check_workspace
+from cablejax.limits import check, check_workspace, require
 from cablejax.mpc.plan import Solver
 from cablejax.mpc.planners import LevenbergMarquardt
 from cablejax.mpc.problem import ObjectiveConfig
@@ -20,7 +20,7 @@ class MPCConfig:
 
     Attributes:
         horizon: h; a plan has h + 1 commands.
-        history_length: samples H of the cable that the model looks back on.
+        history_length: samples H of the cable that the model looks back on: those of a loop's first history.
         cable_length: free length of the cable L [m].
         min_distance: least distance of the grippers, relative to L.
         max_distance: greatest distance of the grippers, relative to L: a taut cable cannot be shaped.
@@ -83,10 +83,16 @@ class MPCConfig:
     def for_length(cls, length: float, **settings: Any) -> MPCConfig:
         """The defaults for a cable of this length [m]: every length among them is in proportion to it.
 
+        The solver's tolerance, a fiftieth of a millimetre, is not.
+
         Args:
             length: free length of the cable [m].
-            settings: fields that are to differ from these defaults.
+            settings: fields that are to differ from these defaults, as they are: lengths in them are not scaled.
+
+        Raises:
+            ValueError: the length or a setting is out of its limits.
         """
+        require(length, "length", "The cable's length")
         ratio = length / cls.cable_length
         own = (
             "cable_length",
@@ -102,7 +108,7 @@ class MPCConfig:
         scaled = {name: ratio * getattr(cls, name) for name in own}
         lengths = {name: ratio * getattr(cls.objective, name) for name in ("rotation_weight", "arrival_margin")}
         scaled["objective"] = dataclasses.replace(cls.objective, **lengths)
-        interval = settings.get("objective", cls.objective).interval
+        interval = getattr(settings.get("objective"), "interval", cls.objective.interval)
         scaled["residual"] = cls.residual and cls.residual.scaled(ratio, interval)
         return cls(**{**scaled, **settings})
 

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.adaptation.belief import update
 from cablejax.limits import LIMITS
@@ -43,7 +43,7 @@ class MPC(eqx.Module):
         config: see `MPCConfig`; static.
         dynamics: offline model `(weights, history, twist) -> displacement`, a pure function; static.
         weights: its arrays; traced, so that new weights do not compile again.
-        target: desired keypoints [m], shape [N, 2]; likewise.
+        target: desired keypoints [m], shape [N, 2]; likewise. A state is of one target: call `init` for another.
 
     Raises:
         ValueError: if the target is not an array of finite keypoints.
@@ -87,7 +87,8 @@ class MPC(eqx.Module):
         Args:
             state: from the last step.
             measurement: keypoints and gripper poses now; a keypoint with a NaN counts as not observed, a pose that is
-                NaN as not measured. With another twist than the last command, the model is judged by that twist.
+                NaN as not measured. With another twist than the last command, the model is judged by that twist; its
+                entries that are NaN are the command's.
 
         Returns:
             The state for the next step, the twist to hold until then (finite and within all bounds) and the report.
@@ -104,7 +105,8 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     """See `MPC.step`."""
     config, dynamics, weights = mpc.config, mpc.dynamics, mpc.weights
     if measurement.twist is not None:
-        state = _commanded(mpc, state, jnp.asarray(measurement.twist, state.last.twist.dtype))
+        executed = jnp.asarray(measurement.twist, state.last.twist.dtype)
+        state = _commanded(mpc, state, jnp.where(jnp.isfinite(executed), executed, state.last.twist))
     state, unobserved = _observe(config, state, measurement)
     model, residual = state.last.model, None
     if config.residual is not None and state.learner is not None:
@@ -119,11 +121,13 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
         objective=config.objective,
     )
     error = problem.shape_error(state.history.keypoints[-1])
-    rho, radius = _update_radius(config, state, error, problem.shape_error(state.last.predicted))
+    # what is not observed is as predicted, which says nothing of the model
+    seen = 2 * state.observed.sum() >= len(state.observed)
+    rho, radius = _update_radius(config, state, error, problem.shape_error(state.last.predicted), seen)
     problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
     start = find_starts(config, problem, state.last.plan, state.progress.best_pose)
     decision = plan_or_hold(config, config.solver(problem, start.guess), start)
-    decision, progress = plan_or_recover(config, state.progress, problem, error, decision, start)
+    decision, progress = plan_or_recover(config, state.progress, problem, error, decision, start, seen)
     next_radius = radius_after(config, state.progress, progress, radius)
     plan = decision.plan
 
@@ -251,7 +255,11 @@ def _feasible_set(config: MPCConfig, state: MPCState) -> FeasibleSet:
 
 
 def _update_radius(
-    config: MPCConfig, state: MPCState, error: Float[Array, ""], predicted_error: Float[Array, ""]
+    config: MPCConfig,
+    state: MPCState,
+    error: Float[Array, ""],
+    predicted_error: Float[Array, ""],
+    seen: Bool[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Rho and the new bound on a step's motion, adapted as a trust region (Wang et al., RA-L 2022, algorithm 1).
 
@@ -261,7 +269,7 @@ def _update_radius(
     """
     before = state.last.shape_error
     actual, predicted = before - error, before - predicted_error
-    telling = (state.steps > 0) & (jnp.abs(predicted) >= config.min_reduction)
+    telling = (state.steps > 0) & seen & (jnp.abs(predicted) >= config.min_reduction)
     rho = jnp.where(telling, 1.0 + (actual - predicted) / jnp.where(telling, jnp.abs(predicted), 1.0), 1.0)
     factor = jnp.where(rho >= config.grow_above, config.grow, jnp.where(rho <= config.shrink_below, config.shrink, 1.0))
     radius = state.radius * jnp.where(telling, factor, 1.0)

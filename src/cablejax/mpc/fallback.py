@@ -63,6 +63,7 @@ def plan_or_recover(
     error: Float[Array, ""],
     decision: Decision,
     start: Starts,
+    seen: Bool[Array, ""],
 ) -> tuple[Decision, Progress]:
     """The decision, a step back to known good poses, or rest; and the progress.
 
@@ -76,11 +77,13 @@ def plan_or_recover(
       worse instead, they go back to where it was best before friction holds it in another shape, and plan again with
       half the bound on their motion (`radius_after`): a trust region's rejected step. They rest there after `RETURNS`
       ways back.
+
+    An error that is mostly of predicted keypoints, `seen` being false, is no better one.
     """
     plan, sound = decision.plan, _sound(decision.plan.result)
     held = decision.action == Action.HOLD
     ways = start.straightening.length, start.back.length
-    progress = _followed(config, progress, problem.pose, error, ways, sound=sound, held=held)
+    progress = _followed(config, progress, problem.pose, error, ways, seen=seen, sound=sound, held=held)
     mode = jnp.where(sound, progress.mode, Action.FOLLOW)
     motion = jnp.select(
         [mode == Action.STRAIGHTEN, mode == Action.RETURN, mode == Action.HOLD],
@@ -98,6 +101,7 @@ def _followed(
     error: Float[Array, ""],
     ways: tuple[Float[Array, ""], Float[Array, ""]],
     *,
+    seen: Bool[Array, ""],
     sound: Bool[Array, ""],
     held: Bool[Array, ""],
 ) -> Progress:
@@ -109,6 +113,7 @@ def _followed(
         pose: of the grippers now, `continued` along the cable.
         error: the shape error now [m].
         ways: lengths of those to where the cable is straight, and to where its shape was best [m].
+        seen: whether the shape now was observed.
         sound: whether the plan may be carried out.
         held: whether it is to hold.
     """
@@ -121,7 +126,7 @@ def _followed(
     woken = resting & ~calming & risen
     planning = (before.mode == Action.FOLLOW) | woken
     best = jnp.where(woken, jnp.inf, before.best_error)
-    better = planning & (error < 0.99 * best)
+    better = planning & seen & (error < 0.99 * best)
     since = jnp.where(better | woken, 0, before.since + 1)
 
     far = error > config.restart_above
@@ -136,7 +141,7 @@ def _followed(
     length = jnp.where(straightening, *ways)
     # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
     needed = jnp.ceil(1.5 * length / config.radius_max).astype(jnp.int32)
-    left = jnp.where(straighten | go_back, needed, before.way_left - 1)
+    left = jnp.where(straighten | go_back, needed, before.way_left - sound)
     # from within a step of straight the planner goes on by itself
     on_way = (left > 0) & (length > jnp.where(straightening, config.radius_max, config.arrived))
     arrived = returning & ~on_way

@@ -145,14 +145,18 @@ class FeasibleSet(AbstractSet):
         return jnp.stack(excess).max()
 
     def empty(self) -> Bool[Array, ""]:
-        """Whether bounds contradict themselves or are NaN; a radius of zero is not empty, it allows rest."""
+        """Whether bounds, or the poses and motions that they are about, contradict themselves or are NaN.
+
+        A radius of zero is not empty: it allows rest.
+        """
         pairs = [(self.min_distance, self.max_distance), (0.0, self.radius)]
         if self.workspace is not None:
             pairs.append((self.workspace[0], self.workspace[1]))
         if self.change is not None:
             pairs.append((0.0, self.change))
         ordered = jnp.stack([jnp.all(lower <= upper) for lower, upper in pairs]).all()
-        return ~(ordered & jnp.isfinite(self.separation).all() & jnp.isfinite(self.radius))
+        known = [x for x in (self.separation, self.radius, self.position, self.previous) if x is not None]
+        return ~(ordered & jnp.stack([jnp.isfinite(x).all() for x in known]).all())
 
     def _separations(self, motion: Float[Array, "T 2 3"]) -> Float[Array, "T 2"]:
         """Position of gripper 1 relative to gripper 0 after each step [m]."""

@@ -22,7 +22,8 @@ class Plan:
     Attributes:
         motion: feasible motions [m], shape [T, Q, 3].
         value: their objective [m^2], shape [].
-        evaluations: rollouts of the model that were spent on trial plans, shape [].
+        evaluations: rollouts of the model that were spent on trial plans, shape []; for `ProjectedGradient` the guess
+            is one.
         result: a `bounded.Result`: how the solve ended, shape [].
         linearisations: gradients or Jacobians that were spent, shape []; None = the solver needs none.
         optimality: largest element of a unit projected gradient step [m] at the last plan whose gradient was taken,

@@ -31,7 +31,10 @@ def bounded_plan(
     solver: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser,
     max_steps: int,
 ) -> Plan:
-    """The plan that a bounded solver finds from a guess; differentiable in the problem where it has converged."""
+    """The plan that a bounded solver finds from a feasible guess, see `ShapingProblem.start`.
+
+    Differentiable in the problem where it has converged.
+    """
 
     def linearise(motion, given):
         problem, guess = given

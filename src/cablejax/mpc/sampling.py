@@ -53,16 +53,20 @@ class CrossEntropy(_Sampling):
             best, mean, deviation = carry
             drawn = drawn_plans(problem, key, mean, deviation, self.samples)
             order = jnp.argsort(drawn.value)[:_ELITES]
-            elite = drawn.motion[order]
-            mean = _SMOOTHING * mean + (1 - _SMOOTHING) * elite.mean(axis=0)
-            deviation = _SMOOTHING * deviation + (1 - _SMOOTHING) * elite.std(axis=0)
+            # plans of which the model gives NaN are no elite
+            known = jnp.isfinite(drawn.value[order])
+            weight = known / jnp.maximum(known.sum(), 1)
+            centre = jnp.tensordot(weight, drawn.motion[order], axes=1)
+            spread = jnp.sqrt(jnp.tensordot(weight, (drawn.motion[order] - centre) ** 2, axes=1))
+            kept = jnp.where(known.any(), _SMOOTHING, 1.0)
+            mean, deviation = kept * mean + (1 - kept) * centre, kept * deviation + (1 - kept) * spread
             return (better_plan(best, drawn, order[0]), mean, deviation), None
 
         first = first_plan(problem, guess)
         deviation = _ELITE_SPREAD * problem.feasible.radius * jnp.ones_like(guess.motion)
         keys = jax.random.split(jax.random.key(_SEED), self.iterations)
         (best, _, _), _ = jax.lax.scan(iterate, (first, first.motion, deviation), keys)
-        return sampled_plan(problem, best, 1 + self.samples * self.iterations)
+        return sampled_plan(problem, best, self.samples * self.iterations)
 
 
 class PathIntegral(_Sampling):
@@ -91,7 +95,7 @@ class PathIntegral(_Sampling):
         (best, mean), _ = jax.lax.scan(iterate, (first, first.motion), keys)
         last = first_plan(problem, problem.start(mean))
         best = jax.tree.map(lambda a, b: jnp.where(last.value < best.value, a, b), last, best)
-        return sampled_plan(problem, best, 2 + self.samples * self.iterations)
+        return sampled_plan(problem, best, 1 + self.samples * self.iterations)
 
 
 class Valued(NamedTuple):

@@ -122,8 +122,9 @@ class MPCInfo:
 
     Attributes:
         shape_error: root mean square distance to the target now [m].
-        rho: actual over predicted reduction of the error by the last command; 1 where it is not known.
-        radius: bound on one step's motion that the command was planned with [m].
+        rho: actual over predicted reduction of the error by the last command; 1 where it is not known, as where more
+            than half of the keypoints were not observed.
+        radius: bound on one step's motion of the plan [m]. Ways back and to the straight cable have `radius_max`.
         objective: value of the plan, or of rest where the plan promised no more, also where the command goes back or
             straightens the cable instead [m^2].
         evaluations: rollouts that the solver spent on trial plans.

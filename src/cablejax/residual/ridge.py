@@ -110,13 +110,14 @@ def fit(
         twist: commands that were held during these steps [m/s, rad/s], shape [W, Q, 3].
         valid: samples to use, per sample or per sample and keypoint, shape [W] or [W, N]. Values of `delta` that are
             not valid are ignored, NaN included.
-        config: window length, penalty and units.
+        config: penalty, forgetting and units.
 
     Raises:
         ValueError: if the shapes do not belong together.
     """
-    window, n_keypoints = delta.shape[:2]
-    if delta.ndim != 3 or twist.shape[0] != window or valid.shape not in ((window,), (window, n_keypoints)):
+    window, n_keypoints = (*delta.shape, 0, 0)[:2]
+    fits = delta.ndim == 3 and twist.ndim == 3 and twist.shape[0] == window and twist.shape[2] == 3
+    if not fits or valid.shape not in ((window,), (window, n_keypoints)):
         raise ValueError(
             f"Shapes delta {delta.shape}, twist {twist.shape}, valid {valid.shape} do not belong together: expected "
             "delta [W, N, 2], twist [W, Q, 3] and valid [W] or [W, N]."
