@@ -246,7 +246,7 @@ def main() -> None:
     worse = {name: np.median(errors[name][:, -1]) / np.median(errors["GNS"][:, -1]) for name in errors}
     page = page_of_results(
         "Which model of the cable?",
-        f"`python experiments/05_dynamics_models.py{' --full' if options.full else ''}`",
+        f"`python experiments/05_dynamics_models.py{' --full' if options.full else ''} --out {options.out}`",
         [
             f"{len(data.gripper_twist)} held-out trajectories of the released model's data, a window every {stride} "
             "samples. All errors are root mean square keypoint distances in cm; a cell has mean, median and 90th "

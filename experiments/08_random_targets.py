@@ -28,8 +28,9 @@ if __name__ == "__main__":
                 "Planar shaping by two arms, 13 keypoints, at most 250 commands of one second; success is a root mean "
                 "square error below 10 mm. `experiments/closed_loop/protocols.py` draws starts and targets, "
                 "since Liang et al. publish no numerical ones; the cable is the MuJoCo plant's with contact and "
-                "friction cones, twice as stiff as the trained one. The published figures are on Liang et al.'s "
-                "own tasks and simulator, for scale only."
+                "friction cones, twice as stiff as the reference cable; `gns-no-prior` was trained on cables of 0.05 "
+                "to 3 times its stiffness. The published figures are on Liang et al.'s own tasks and simulator, for "
+                "scale only."
             ),
             small=Extent(random_cases, seeds=range(2), methods=(NO_PRIOR_LEARNER,)),
             full=Extent(random_cases, seeds=range(50), methods=(DIRECT, RESIDUAL, LEARNER, NO_PRIOR_LEARNER)),

@@ -36,9 +36,8 @@ from cablejax.bounded import (
     least_squares,
     minimise,
 )
-from cablejax.provenance import machine, versions
 from pages import markdown_table, page_of_results, publish
-from rows import Rows
+from rows import Rows, made_on
 from standard_problems import BoundedProblem, all_problems
 
 TOLERANCE = 1e-10
@@ -276,7 +275,7 @@ def failures(runs: list[Run]) -> list[list[str]]:
     return rows
 
 
-def page(runs: list[Run], command: str) -> str:
+def page(runs: list[Run], command: str, made: str) -> str:
     """The Markdown page."""
     return page_of_results(
         "Bounded solvers on standard problems",
@@ -312,7 +311,7 @@ def page(runs: list[Run], command: str) -> str:
             "",
             *markdown_table(effort(runs)),
         ],
-        made_on=f"{versions()}, scipy {scipy.__version__}; {machine()}.",
+        made_on=made,
     )
 
 
@@ -327,7 +326,8 @@ def main() -> None:
     warnings.simplefilter("ignore")  # scipy's, of overflow in trial points
     problems = [problem for problem in all_problems() if options.family in (None, problem.family)]
     runs = run_all(problems, options.cache, tuple(options.solver))
-    text = page(runs, "python experiments/10_bounded_solvers.py --out docs/results/bounded_solvers.md")
+    made = f"{made_on(options.cache)} The page: scipy {scipy.__version__}."
+    text = page(runs, "python experiments/10_bounded_solvers.py --out docs/results/bounded_solvers.md", made)
     publish(text, options.out)
 
 

@@ -59,13 +59,16 @@ from against_ipopt.planning_problems import (
 )
 from against_ipopt.referee import RefereeConfig
 from cablejax.control.shaping import Model, load_model
+from cablejax.dynamics.weights import fingerprint
 from cablejax.mpc import SOLVERS
-from cablejax.provenance import machine, versions
+from cablejax.provenance import machine
 from executors import add_option, executor_of
 from pages import page_of_results, publish
+from rows import MADE_ON, made_on, read_rows
 
 FOLDER = Path("docs") / "results" / "trials" / "against_ipopt"
 """Problems and rows, kept with the repository: a thousand problems take longer than one sitting."""
+CASES = "cases.npz"
 RELEASED = "gns-reference"
 STARTS = 6
 """Further starts, at most, for a problem on which the first does not meet all that is asked."""
@@ -92,6 +95,12 @@ def referees(exact: bool) -> list[RefereeConfig]:
 def run(options: argparse.Namespace, cases: list[PlanningCase], folder: Path, executor: Executor | None) -> None:
     """Judges what has no row yet, until the time is up."""
     rows = rows_of(folder)
+    mine = fingerprint(load_model(options.weights).weights)
+    if other := sum(row.get("weights") != mine for row in rows.read()):
+        raise SystemExit(
+            f"{rows.path} has {other} rows of other weights than {options.weights} has now, and a table is of one "
+            f"network: give another --folder, with a copy of {options.folder / CASES}."
+        )
     exact = frozenset(case.name for case in cases[: options.exact])
     # with the exact Hessian again where that was not asked for before
     short = {row["name"] for row in rows.read() if "exact" not in row} & exact
@@ -105,7 +114,8 @@ def judged(weights: str, folder: Path, exact: frozenset[str], name: str) -> dict
     """The row of one problem."""
     cases, ours = compiled(weights, folder, name in exact)
     row = judge(ours, cases[name], referees(name in exact))
-    return {**row, "machine": machine(), "threads": os.environ["NPROC"]}
+    weights = fingerprint(load_model(weights).weights)
+    return {**row, "weights": weights, "machine": machine(), "threads": os.environ["NPROC"]}
 
 
 @functools.lru_cache
@@ -121,7 +131,7 @@ def compiled(weights: str, folder: Path, exact: bool) -> tuple[dict[str, Plannin
 @functools.lru_cache
 def known(weights: str, folder: Path) -> tuple[dict[str, PlanningCase], Contestant]:
     """The problems in a folder, and ours for one model."""
-    return {case.name: case for case in load_cases(folder / "cases.npz")}, contestant(load_model(weights))
+    return {case.name: case for case in load_cases(folder / CASES)}, contestant(load_model(weights))
 
 
 def explain_all(ours: Contestant, cases: list[PlanningCase], folder: Path, seconds: float) -> None:
@@ -170,10 +180,14 @@ def page(options: argparse.Namespace, folder: Path, n_all: int) -> str:
     for finished, option in ((explained, "explain"), (kinks, f"kinks {len(kinks)}"), (calls, f"calls {len(calls)}")):
         done += f", `--{option}`" if finished else ""
     weights = "" if options.weights == RELEASED else f" --weights {options.weights}"
-    machines = ", ".join(sorted({row["machine"] for row in rows}))
+    path, machines = rows_of(folder).path, ", ".join(sorted({row["machine"] for row in rows}))
+    kept = any(MADE_ON in row for row in read_rows(path))
+    made = made_on(path) if kept else f"Versions were not kept; {machines}."
+    mine = fingerprint(load_model(options.weights).weights)
+    older = "" if all(row.get("weights") == mine for row in rows) else ", as it was released earlier,"
     lines = [
         f"{len(rows)} of {n_all} problems, in a random order, seed 0; {n_exact} of them with the exact Hessian too. "
-        f"Network {options.weights} with smoothed ReLUs and the residual fitted online, horizon 5, "
+        f"Network {options.weights}{older} with smoothed ReLUs and the residual fitted online, horizon 5, "
         f"36 unknowns, float64. Our solver: `against_ipopt.accurate.{ACCURATE}`. "
         "IPOPT: tol 1e-9 on the objective divided by its value at the start, constr_viol_tol 1e-9, "
         f"bound_relax_factor 0, adaptive mu, limited memory of 20, at most {ITERATIONS} iterations, or exact Hessian, "
@@ -185,7 +199,7 @@ def page(options: argparse.Namespace, folder: Path, n_all: int) -> str:
         "Against IPOPT",
         f"`python experiments/11_against_ipopt.py{weights} --report {options.report}`, after {done}",
         lines,
-        made_on=f"{versions()}, ipyopt {version('ipyopt')}; {machines}; {platform.machine()}, "
+        made_on=f"{made} The page: ipyopt {version('ipyopt')}; {platform.machine()}, "
         f"NPROC={'/'.join(sorted({row['threads'] for row in rows}))}. The machine had other work to do: times "
         "are inflated; only their ratios are meaningful.",
     )
@@ -205,7 +219,7 @@ def main() -> None:
     parser.add_argument("--calls", type=int, help="time a control call and IPOPT on this many problems")
     parser.add_argument("--report", type=Path, help="write the page of the finished rows, and run nothing")
     options = parser.parse_args()
-    cases_path = options.folder / "cases.npz"
+    cases_path = options.folder / CASES
     if options.draw:
         draw(cases_path)
         return

@@ -96,7 +96,7 @@ def main() -> None:
             rows.append([name, *cells, quantiles(change), f"{(change < 0).sum()} / {(change > 0).sum()}"])
     page = page_of_results(
         "Slopes in bfloat16",
-        f"`python experiments/13_rough_slopes.py --n {options.n} --weights {options.weights}`",
+        f"`python experiments/13_rough_slopes.py --n {options.n} --weights {options.weights} --out {options.out}`",
         [
             f"{options.n} planning problems, {model.name} with the residual fitted online, horizon 5, float32. Both "
             "kinds take turns, so that other load on the machine affects both. Exact is `jax.jacrev` of the whole "

@@ -205,15 +205,17 @@ def page(out: pathlib.Path) -> str:
         "in a letter's gripper poses, as if shown by hand. A verdict on "
         f"six runs ({6 * COMMANDS} s, 1 mm noise, seeds {', '.join(map(str, LOG_SEEDS))}) informs the model "
         "of the arm *diagnosed*. That of *plain* is informed of nothing, that of *oracle* of the true effect, and that "
-        f"of *recorded* is trained on the same six runs instead. All learn online. {len(seeds)} seeds.",
+        f"of *recorded* is trained on the same six runs instead. All learn online. {len(seeds)} seeds"
+        f"{_fewer(trials, len(seeds))}.",
         "",
     ]
     for title, measure in MEASURES.items():
+        never = "" if measure is late else f" A run that never gets there counts {STEPS} s."
         table = [row for text in (*EFFECTS, *LEARNED) for row in rows_of(trials, text, measure)]
         lines += [
             f"## {title}",
             "",
-            "Mean, standard deviation, count.",
+            f"Mean, standard deviation, count.{never}",
             "",
             *markdown_table([["effect", "letter", *(spec.name.removesuffix(ONLINE) for spec in ARMS)], *table]),
             "",
@@ -231,6 +233,12 @@ def page(out: pathlib.Path) -> str:
     command = "python experiments/23_worth.py --out docs/results/trials/worth --report docs/results/worth.md"
     made = made_on(out / "trials" / TRIALS)
     return page_of_results("What a diagnosis is worth", f"`{command}`", lines, made_on=made)
+
+
+def _fewer(trials: Sequence[Trial], count: int) -> str:
+    """The effects of which fewer seeds have run."""
+    seeds = {text: len({trial.seed for trial in trials if trial.table == text}) for text in (*EFFECTS, *LEARNED)}
+    return "".join(f", {own} of `{text}`" for text, own in seeds.items() if 0 < own < count)
 
 
 PAIRED_HEAD = (
@@ -290,7 +298,7 @@ def rows_of(trials: Sequence[Trial], text: str, measure: Callable[[Trial], float
 
 def cell(values: Values) -> str:
     numbers = np.array(list(values.values()))
-    return f"{numbers.mean():.2f} ± {numbers.std():.2f} ({len(numbers)})" if len(numbers) else ""
+    return f"{numbers.mean():.2f} ± {numbers.std(ddof=1):.2f} ({len(numbers)})" if len(numbers) else ""
 
 
 def paired_row(

@@ -185,7 +185,8 @@ def page(rows: list[dict[str, Any]], made: str) -> str:
         lines += ["", f"Without a staged effect the verdict is **{by_name['none']['verdict']}**."]
     return page_of_results(
         "What is named is added",
-        "`python experiments/24_named_is_added.py --rows ROWS --report FILE`",
+        "`python experiments/24_named_is_added.py --rows docs/results/named_is_added.jsonl` and "
+        "`--report docs/results/named_is_added.md`",
         lines,
         made_on=made,
     )

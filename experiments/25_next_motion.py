@@ -200,25 +200,33 @@ def made_in(row: dict[str, Any]) -> int:
     return len(row["logs"]) - 1
 
 
+def answered(row: dict[str, Any], added: int) -> bool:
+    """Whether after at most so many added motions only the truth is left, and what nothing could separate from it."""
+    left = after(row, added)["open"]
+    others = set(left) - {row["truth"]}
+    return row["truth"] in left and (not others or {row["truth"], *others} == INSEPARABLE)
+
+
 def needed(row: dict[str, Any]) -> float:
-    """Motions after which only the truth is left, and what nothing could separate from it; infinite = not reached."""
-    for added, log in enumerate(row["logs"]):
-        others = set(log["open"]) - {row["truth"]}
-        if row["truth"] in log["open"] and (not others or {row["truth"], *others} == INSEPARABLE):
-            return added
-    return np.inf
+    """Motions after which a row is first `answered`; infinite = not reached."""
+    return next((added for added in range(len(row["logs"])) if answered(row, added)), np.inf)
 
 
 def table_of_needs(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """By arm: seeds that are answered after so many motions, and the median of motions needed by the rest."""
+    """By arm: seeds that are answered after so many motions, or wrongly, and the median of motions for the rest."""
     first = {row["seed"] for row in rows if needed(row) == 0}
     head = ["arm", "by the first log", *(f"with {n} more motion{'s' * (n > 1)}" for n in range(1, ADDED + 1))]
-    table = [[*head, "motions that the others need, median"]]
+    table = [[*head, "one explanation left in the end, and wrong", "motions that the others need, median"]]
     for arm in dict.fromkeys(row["arm"] for row in rows):
         needs = {row["seed"]: needed(row) for row in rows if row["arm"] == arm}
-        counts = [f"{sum(n <= added for n in needs.values())} of {len(needs)}" for added in range(ADDED + 1)]
+        own = [row for row in rows if row["arm"] == arm]
+        counts = [f"{sum(answered(row, added) for row in own)} of {len(own)}" for added in range(ADDED + 1)]
+        last = [(after(row, ADDED)["open"], row["truth"]) for row in own]
+        wrong = sum(len(left) == 1 and left != [truth] for left, truth in last)
         median = np.median([n for seed, n in needs.items() if seed not in first] or [0])
-        table.append([arm, *counts, f"{median:g}" if median <= ADDED else f"more than {ADDED}"])
+        table.append(
+            [arm, *counts, f"{wrong} of {len(own)}", f"{median:g}" if median <= ADDED else f"more than {ADDED}"]
+        )
     return table
 
 

@@ -305,7 +305,8 @@ def page(rows: list[dict[str, Any]], every: list[dict[str, Any]], made: str) -> 
         "",
         f"EI/rho from the two halves of the recordings is within {100 * NEAR:.0f} % on {near[0]} cables, {near[1]}. "
         f"Windows lost or off by ten times the median: {lost} of {windows}, and {lost_of_all} of {windows_of_all} on "
-        f"all {len(every)} cables that are kept, those of earlier fits included. A cable takes "
+        f"all {sum('broken' not in row for row in every)} cables that are kept, those of earlier fits included. "
+        "A cable takes "
         f"{np.median([row['seconds'] for row in rows]):.0f} s (median, its simulation and the estimates of the halves "
         f"included). All effects together reduce the median error on unseen recordings from "
         "{:.1f} to {:.1f} mm.".format(*np.median([row["error_mm"] for row in rows], axis=0)),

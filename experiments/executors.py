@@ -154,10 +154,11 @@ def results(
         executor: where; None = here, one after the other.
         make: can be pickled, unless it is called here.
         keys: its arguments.
-        going: no other call begins once this is false.
+        going: no other call begins once this is false; those that have begun are waited for.
 
     Raises:
-        ExecutorError: a process ended, or the cluster lost its workers: what was yielded stands.
+        ExecutorError: a process ended, or the cluster lost its workers: what was yielded stands. As where a call
+            failed, what was done by then is yielded first.
     """
     if executor is None:
         for key in keys:
@@ -172,16 +173,20 @@ def results(
             done, waiting = concurrent.futures.wait(waiting, SECONDS, concurrent.futures.FIRST_COMPLETED)
             if not done and isinstance(executor, _Opaque) and executor.abandoned():
                 raise ExecutorError(f"The cluster has no workers any more. {_GO_ON}")
+            failed = None
             for future in done:
                 try:
                     result = future.result()
                 except Exception as error:
-                    if lost := _lost(error):
-                        raise ExecutorError(f"{lost} {_GO_ON}") from error
-                    raise
+                    failed = failed or error
+                    continue
                 yield pending[future], result
-                if not going():
-                    return
+            if failed is not None:
+                if lost := _lost(failed):
+                    raise ExecutorError(f"{lost} {_GO_ON}") from failed
+                raise failed
+            if not going():
+                waiting = {future for future in waiting if not future.cancel()}
     finally:
         for future in pending:
             future.cancel()

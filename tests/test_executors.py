@@ -13,7 +13,7 @@ import time
 
 import pytest
 
-from executors import ExecutorError, add_option, executor_of
+from executors import ExecutorError, add_option, executor_of, results
 from rows import Rows
 
 EXPERIMENTS = pathlib.Path(__file__).parents[1] / "experiments"
@@ -199,3 +199,38 @@ def test_a_cluster_that_cannot_be_reached_is_a_message_at_the_start(monkeypatch)
     for address in (f"tcp://127.0.0.1:{free_port()}", "tcp://127.0.0.1", f"tls://127.0.0.1:{free_port()}"):
         with pytest.raises(ExecutorError, match=f"No Dask scheduler answers at {address}"):
             connect(address)
+
+
+@pytest.mark.parametrize("executor", ["2", "1"])
+def test_rows_that_have_begun_are_kept_when_the_time_is_up(tmp_path, executor):
+    """Each process has a row in hand then; they are waited for, and were thrown away."""
+    rows = rows_in(tmp_path)
+    with executor_of(executor) as pool:
+        rows.run(KEYS, functools.partial(slow_square, tmp_path), executor=pool, seconds=0.3, progress=False)
+    made, begun = {row["number"] for row in rows.read()}, {int(p.name.split("-")[0]) for p in tmp_path.glob("*-*")}
+    assert made == begun and 0 < len(made) < len(KEYS)
+
+
+def square_or_fail(number: int) -> dict[str, int]:
+    if number == 0:
+        raise ValueError("number 0 fails")
+    return {"square": number**2}
+
+
+def test_a_row_that_fails_does_not_lose_those_that_were_done_with_it():
+    """The order in which finished rows come is not theirs."""
+
+    class Finished(concurrent.futures.Executor):
+        def submit(self, fn, /, *args, **kwargs):
+            future = concurrent.futures.Future()
+            try:
+                future.set_result(fn(*args, **kwargs))
+            except ValueError as error:
+                future.set_exception(error)
+            return future
+
+    done = []
+    with pytest.raises(ValueError, match="number 0 fails"):
+        for key, result in results(Finished(), square_or_fail, KEYS[:4]):
+            done.append((key, result["square"]))
+    assert sorted(done) == [((1,), 1), ((2,), 4), ((3,), 9)]

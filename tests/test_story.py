@@ -1,6 +1,5 @@
-"""The experiment and the notebook that tell the story, executed at smoke size."""
+"""The notebook that tells the story, executed at smoke size."""
 
-import importlib.util
 import pathlib
 
 import nbformat
@@ -15,29 +14,6 @@ ROOT = pathlib.Path(__file__).parents[1]
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     return small_model(tmp_path_factory.mktemp("model"))
-
-
-def load(script: str):
-    spec = importlib.util.spec_from_file_location("experiment", ROOT / "experiments" / script)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.mark.slow
-def test_experiment_shapes_a_cable(weights, tmp_path, capsys):
-    arguments = ["--steps", "1", "--links", "12", "--weights", str(weights), "--out", str(tmp_path)]
-    load("01_shape_a_cable.py").main(arguments)
-    shown = capsys.readouterr().out
-    assert shown.startswith("residual") and "\ndirect" in shown
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "error_over_time.png",
-        "final_shapes.png",
-        "residual_share.png",
-        "shape.gif",
-        "snapshots.png",
-    ]
 
 
 @pytest.mark.slow

@@ -15,11 +15,11 @@ from closed_loop.suite import Case
 from closed_loop.trials import LIANG_TABLE
 
 STIFFNESS_RATIOS = (0.1, 0.5, 1.0, 2.0, 3.0)
-"""Wang et al., RA-L 2022: the cable's stiffness over the trained one's."""
+"""Wang et al., RA-L 2022: the cable's stiffness over the reference cable's."""
 NEARBY = "nearby"
 """Table of plants that differ by less than anybody knows a cable's stiffness."""
 NEARBY_RATIOS = (1.9, 1.925, 1.95, 1.975, 2.0, 2.02, 2.04, 2.06, 2.08, 2.1)
-"""Their stiffness over the trained one's."""
+"""Their stiffness over the reference cable's."""
 RANDOM_TASK_STIFFNESS = 2.0
 """The same in the tasks of Liang et al., who do not vary it."""
 PLANT_CHAIN = Discretisation(n_links=24, dimension=3, timestep=0.005)

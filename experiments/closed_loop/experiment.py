@@ -99,6 +99,11 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None
             )
     everything, pictures = read_suite(folder)
     trials = [trial for trial in everything if trial.seed in seeds]
+    if options.report is not None and not trials:
+        parser.error(
+            f"{folder / TRIALS} has no trial of these seeds: copy docs/results/trials/{experiment.name}.jsonl there, "
+            "or run them first, without --report"
+        )
     shown = {trial.key for trial in trials}
     picture = None
     if options.report is not None:
@@ -155,15 +160,16 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, made: st
         lines += ["", tables.settling_table(mine, table)]
         lines += ["", "### By stiffness", "", tables.stiffness_table(mine, table)]
         lines += ["", "### How runs end", "", interval_tables.end_table(mine, table)]
-        lines += ["", "### Intervals and failures", "", interval_tables.interval_table(mine, table)]
+        lines += ["", "### Intervals and failures", "", interval_tables.INTERVAL_NOTE]
+        lines += ["", interval_tables.interval_table(mine, table)]
         methods = {trial.method for trial in mine}
         if any({learning, base} <= methods for learning, base in WITHOUT_LEARNING.items()):
             lines += [
                 "",
                 "### What learning online changes",
                 "",
-                f"Wins / losses in pairs, by means of the last {LATE} s; p assumes independent pairs, although pairs "
-                "of one seed share their start.",
+                f"Wins / losses in pairs, by means of the last {LATE} s; p is of the one-sided sign test, as if pairs "
+                "were independent, although those of one seed share their start.",
             ]
             lines += ["", interval_tables.learning_table(mine, table, WITHOUT_LEARNING)]
         if NO_PRIOR_LEARNER in methods and len(methods) > 1:

@@ -160,7 +160,7 @@ def disturbance_of(seed: int) -> str:
 
 
 def disturbed_plant(seed: int) -> Plant:
-    """The plant in which it happens; the cable is half, once or twice as stiff as the one trained on."""
+    """The plant in which it happens; the cable is half, once or twice as stiff as the reference cable."""
     rng, name = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(8,))), disturbance_of(seed)
     stiffness = GivenEffect("bending_stiffness", (("ratio", float(rng.choice([0.5, 1.0, 2.0]))),))
     random = {"angle": f"{rng.uniform(0.0, 2 * np.pi):.3f}", "gripper": rng.integers(2)}
@@ -171,7 +171,7 @@ def disturbed_plant(seed: int) -> Plant:
 
 
 def recorded_plant() -> Plant:
-    """Our cable, twice as stiff as the one trained on."""
+    """Our cable, twice as stiff as the reference cable."""
     return Plant(
         PlantConfig(discretisation=PLANT_CHAIN, effects=(GivenEffect("bending_stiffness", (("ratio", 2.0),)),))
     )

@@ -20,7 +20,7 @@ from closed_loop.cells import (
     trials_of_table,
 )
 from closed_loop.paper import LIANG
-from closed_loop.statistics import Interval, mean_interval, paired_difference, summarise
+from closed_loop.statistics import FEW, Interval, mean_interval, paired_difference, summarise
 from closed_loop.trials import LATE, LIANG_TABLE, Trial
 
 RESTING_MM = 0.3
@@ -28,11 +28,16 @@ RESTING_MM = 0.3
 SUCCESS_CM = 1.0
 """Liang et al.: a shape is reached below this root mean square error [cm]."""
 
+INTERVAL_NOTE = (
+    f"Intervals are of the mean over seeds: of fewer than {FEW} by Student's t, which may begin below zero, else by "
+    "the bootstrap."
+)
+
 
 def interval_table(trials: Iterable[Trial], table: str) -> str:
-    """What a mean hides: its 95 % bootstrap interval, the median, the worst trial, and failures.
+    """What a mean hides: its 95 % interval, the median, the worst trial, and failures.
 
-    The interval resamples seeds, since trials of one seed share their start.
+    The interval is that of the mean over seeds, since trials of one seed share their start, see `mean_interval`.
 
     Raises:
         ValueError: there is no trial of this table.
