@@ -28,11 +28,11 @@ if __name__ == "__main__":
                 "cable and gets a command each second. For keypoints only (90 commands), the target is a shape in "
                 "which friction left another cable, of random stiffness, friction and rest curvature. The shaped cable "
                 "is twice as stiff as the reference cable. Its best possible result is the nearest frictionless "
-                "resting shape that respects the controller's bounds on the grippers' distance; the straight drive does not "
-                "respect them. In disturbed runs (60 commands; U, S or Z), something happens after 29 s, or the "
-                "observation is poor throughout; the cable is half, once or twice as stiff as the reference cable. A "
-                "run is judged by the mean error of its last ten seconds. `experiments/closed_loop/harder.py` makes the "
-                "tasks."
+                "resting shape that respects the controller's bounds on the grippers' distance; the straight drive "
+                "does not respect them. In disturbed runs (60 commands; U, S or Z), something happens after 29 s, or "
+                "the observation is poor throughout; the cable is half, once or twice as stiff as the reference cable. "
+                "A run is judged by the mean error of its last ten seconds. `experiments/closed_loop/harder.py` makes "
+                "the tasks."
             ),
             small=Extent(harder_cases, seeds=range(6), methods=(NO_PRIOR_LEARNER,)),
             full=Extent(
