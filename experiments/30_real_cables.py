@@ -20,6 +20,7 @@ import os
 import pathlib
 import sys
 
+import cablejax
 from cablejax.recordings.deform import DeformRecordings, read_deform, repaired_blocks
 from pages import publish
 from real_cables.benchmark import score_cable
@@ -27,6 +28,12 @@ from real_cables.page import Notes, errors_figure, page, read_published
 from real_cables.protocol import cables_in, protocol_windows
 from rows import Rows, made_on
 
+_PACKAGE = pathlib.Path(cablejax.__file__).parent
+# Whose code decides a score: one of an earlier fit is not printed as today's.
+_SCORING = (
+    *(_PACKAGE / room for room in ("bounded", "diagnose", "simulate/rod", "spatial")),
+    pathlib.Path(__file__).parent / "real_cables",
+)
 _PUBLISHED = pathlib.Path(__file__).parent / "real_cables" / "published.csv"
 
 
@@ -87,10 +94,13 @@ def _read(folder: pathlib.Path) -> tuple[dict[str, DeformRecordings], dict[str, 
 
 
 def _key(recordings: DeformRecordings) -> tuple[str, str]:
-    """The cable's name and a hash of its recordings."""
+    """The cable's name and a hash of its recordings and of the code that scores them."""
     digest = hashlib.sha256(repr((recordings.keypoints.shape, recordings.dt, recordings.split.tolist())).encode())
     for array in (recordings.keypoints, recordings.recording, recordings.source_id):
         digest.update(array.tobytes())
+    for room in _SCORING:
+        for source in sorted(room.glob("*.py")):
+            digest.update(source.read_bytes())
     return recordings.name, digest.hexdigest()[:16]
 
 

@@ -112,3 +112,12 @@ def test_derivatives_match_finite_differences():
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match="AdaptationConfig"):
         AdaptationConfig(**wrong)
+
+
+def test_a_belief_has_the_type_of_the_observations():
+    """Or a model in single precision would go on in double, and a loop over its steps fails."""
+    with jax.enable_x64(True):
+        sensitivity = jnp.full((13, 2, 2), 1e-2, jnp.float32)
+        belief = prior_belief(AdaptationConfig(), jnp.float32)
+        after = update(AdaptationConfig(), belief, sensitivity, jnp.full((13, 2), 1e-3, jnp.float32), SEEN)
+        assert {leaf.dtype for one in (belief, after) for leaf in jax.tree.leaves(one)} == {np.dtype(np.float32)}

@@ -147,6 +147,25 @@ def test_lerobot_has_the_layout_of_its_own_data_sets(tmp_path):
     assert tasks.to_pydict() == {"task_index": [0, 1], "__index_level_0__": ["approach_u", "return to $U$"]}
 
 
+def test_lerobot_splits_are_those_of_the_log(tmp_path):
+    """All episodes were for training, those of the eval split too."""
+    needs("pyarrow")
+    log = planar()
+    for split, expected in (
+        (None, {"train": "0:2"}),
+        (["", "eval"], {"train": "0:1", "eval": "1:2"}),
+        (["eval", "eval"], {"eval": "0:2"}),
+    ):
+        meta = log.meta if split is None else {**log.meta, "split": split}
+        folder = write_lerobot(tmp_path / f"{len(expected)}{split}", dataclasses.replace(log, meta=meta))
+        assert json.loads((folder / "meta/info.json").read_text())["splits"] == expected
+    four = joined([log, dataclasses.replace(log, keypoints=log.keypoints + 1e-3)], ["one", "other"])
+    mixed = dataclasses.replace(four, meta={**four.meta, "split": ["train", "eval", "train", ""]})
+    with pytest.raises(GapLogError, match=r"meta\.split' is \['train', 'eval'.*one range of episodes for each split"):
+        write_lerobot(tmp_path / "mixed", mixed)
+    assert not (tmp_path / "mixed").exists()
+
+
 def test_lerobot_is_read_by_reruns_reader(tmp_path):
     needs("pyarrow")
     reader = needs("rerun.experimental")

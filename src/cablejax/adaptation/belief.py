@@ -14,6 +14,7 @@ ratio of stiffness to friction is identifiable; in the other direction c stays a
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -85,9 +86,11 @@ class CableBelief:
     information: Float[Array, "*batch 2 2"]
 
 
-def prior_belief(config: AdaptationConfig) -> CableBelief:
-    """The belief before any observation."""
-    return CableBelief(mean=jnp.array(config.prior_mean), information=jnp.eye(2) / config.prior_std**2)
+def prior_belief(config: AdaptationConfig, dtype: Any = float) -> CableBelief:
+    """The belief before any observation, in this type of numbers: that of the observations."""
+    return CableBelief(
+        mean=jnp.array(config.prior_mean, dtype), information=jnp.eye(2, dtype=dtype) / config.prior_std**2
+    )
 
 
 def update(
@@ -113,7 +116,7 @@ def update(
     size = jnp.sum(innovation**2) / jnp.maximum(2 * jnp.sum(finite), 1)
     # Geman and McClure's: the pull of an error falls as its third power, so that no snap-through moves the belief
     weight = 1.0 / (1.0 + size / config.outlier**2) ** 2
-    prior = prior_belief(config)
+    prior = prior_belief(config, belief.mean.dtype)
     forgotten = (1.0 - config.memory) * prior.information
     faded = config.memory * belief.information + forgotten
     information = faded + weight * rows.T @ rows
@@ -122,4 +125,5 @@ def update(
     returning = jnp.linalg.solve(faded, forgotten @ (prior.mean - belief.mean))
     step = returning + jnp.linalg.solve(information, weight * rows.T @ (innovation - rows @ returning))
     step = jnp.clip(step, -config.max_step, config.max_step)
-    return CableBelief(mean=jnp.clip(belief.mean + step, *jnp.asarray(config.limits).T), information=information)
+    low, high = jnp.asarray(config.limits, belief.mean.dtype).T
+    return CableBelief(mean=jnp.clip(belief.mean + step, low, high), information=information)

@@ -165,7 +165,7 @@ class RunLog:
         report = {
             "counts": self.counts,
             "starts_s": [start for start, _ in pieces],
-            "events": [(since if math.isfinite(since) else None, *told) for since, *told in self.events],
+            "events": [(since if math.isfinite(since) else None, *rest) for since, *rest in self.events],
             "refused": self.refused[:100],
         }
         episodes = [episode for _, episode in pieces]

@@ -155,7 +155,7 @@ def initial_state(config: MPCConfig, history: History) -> MPCState:
     dtype, zero = history.keypoints.dtype, jnp.zeros((), jnp.int32)
     estimate = None
     if config.adaptation is not None:
-        estimate = CableEstimate(prior_belief(config.adaptation), jnp.zeros((n_keypoints, 2, 2), dtype))
+        estimate = CableEstimate(prior_belief(config.adaptation, dtype), jnp.zeros((n_keypoints, 2, 2), dtype))
         history = dataclasses.replace(history, cable=estimate.belief.mean)
     return MPCState(
         history=history,

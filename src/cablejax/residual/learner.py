@@ -22,7 +22,7 @@ The candidates are made of these parts:
 - The share of the model's response to the command that does not take place. Where friction holds the middle of a cable,
   its ends move with the grippers and it does not: one number beta_i for each keypoint. The correction is
   `-beta_i (df_i/dR) R`, with the derivative about no command. A regression on the command alone has six numbers for
-  each coordinate, and where the grippers creep five samples cannot tell them.
+  each coordinate, and where the grippers creep five samples do not determine them.
 - Ridge regression on the command (`residual.ridge`, the paper's). It can express any error that is linear in the
   command, and needs decimetres of motion to learn it.
 """
@@ -213,7 +213,7 @@ def observe(config: LearnerConfig, state: LearnerState, sample: Sample) -> Learn
     fade = jnp.where(seen > 0, config.memory, 1.0).astype(loss.dtype)
     return LearnerState(
         window=window,
-        # an error too large to be squared tells nothing either
+        # an error too large to be squared is no evidence either
         evidence=fade * state.evidence + jnp.where(telling > 0, telling * loss[:-1], 0.0),
         count=fade * state.count + telling * (seen > 0),
         loss=state.loss + loss,

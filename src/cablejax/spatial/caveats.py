@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.judgement import listed
 from cablejax.spatial.cable import GOOD_FIT
 from cablejax.spatial.effects import GRIP
@@ -13,6 +14,15 @@ from cablejax.spatial.windows import Windows
 
 STIFF = 3.0
 """A cable that is not so many times longer than the length over which it bends is held up by its grippers."""
+
+
+def hidden_sentence(gap: Gap) -> str:
+    """The verdict on a cable whose nominal simulation amplifies noise too much to be judged."""
+    return (
+        "Whether the simulator is wrong about this cable cannot be told: it amplifies noise until it is as far off "
+        f"itself as from the recording. With effects of the library the error falls from {gap.before_rmse_mm:.1f} to "
+        f"{gap.after_rmse_mm:.1f} mm, more than by the noise alone: record calmer motions."
+    )
 
 
 def caveats(

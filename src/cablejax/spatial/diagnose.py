@@ -19,7 +19,7 @@ from cablejax.provenance import package_versions
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, moderated
 from cablejax.spatial.cable import SpatialCable
-from cablejax.spatial.caveats import caveats
+from cablejax.spatial.caveats import caveats, hidden_sentence
 from cablejax.spatial.clock import on_one_clock, with_poses_in_time
 from cablejax.spatial.gap import constant_offset, in_log, squares, where_of
 from cablejax.spatial.geometry import local_changes
@@ -84,11 +84,14 @@ def diagnose_space(
     counted, after = windows.chosen(says.use), says.after[says.use]
     cut = _seconds(says.compared.windows) if says.compared.windows.valid.sum() < counted.valid.sum() else None
     sentence = verdict_sentence(says.verdict, says.effects, says.equivalent, says.share)
+    if says.undecided:
+        sentence = hidden_sentence(says.gap)
     offset = ParameterEstimate(constant_offset(after, counted), None, "m")
     where = where_of(log, counted, says.before[says.use], noise, says.smallest, changes)
     nominal, explained = (in_log(log, windows, part) for part in (says.before, says.after))
     return SpatialDiagnosis(
         verdict=says.verdict,
+        undecided=says.undecided,
         sentence=" ".join([sentence, *changes[:1], *shifted]),
         effects=says.effects,
         equivalent=says.equivalent,
