@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
+import types
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,13 +23,14 @@ from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.spatial.cable import SpatialCable, errors
+from cablejax.spatial.caveats import hidden_sentence
 from cablejax.spatial.clock import on_one_clock, thinned, with_poses_in_time
 from cablejax.spatial.diagnose import _ranking, diagnose_space
 from cablejax.spatial.estimate import Estimate
 from cablejax.spatial.gap import OWN, is_gap, own_error, smallest_gap, where_of, with_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import TWISTED, Identified, _searched, _twisted, layout_of
-from cablejax.spatial.judge import _equivalent
+from cablejax.spatial.judge import _equivalent, judge
 from cablejax.spatial.named import _damped
 from cablejax.spatial.search import Step, falls, halves
 from cablejax.spatial.windows import windows_of
@@ -158,6 +161,36 @@ def test_grippers_that_rest_are_never_fast():
     before = np.nan_to_num(windows.keypoints) + 0.01
     where = where_of(log, windows, before, 1e-4, 1e-3, ())
     assert set(where.regimes) == {"speed: slow"} and not any("nan" in text for text in where.sentences)
+
+
+@pytest.mark.parametrize(
+    ("better", "accepted", "verdict"), [(0.9, True, "unknown"), (0.9, False, "none"), (0.3, True, "none")]
+)
+def test_a_gap_that_amplified_noise_hides_is_undecided(monkeypatch, better, accepted, verdict):
+    """The nominal cable counts as off by itself by half a metre, so that no gap can be told from that."""
+    monkeypatch.setattr("cablejax.spatial.gap.own_error", lambda *arguments: 0.5)
+    monkeypatch.setattr("cablejax.spatial.judge.own_error", lambda *arguments: 0.5)
+    monkeypatch.setattr("cablejax.spatial.judge.named_effects", lambda found, density: ())
+    windows = windows_of(cases.recording())
+    cable = SpatialCable(Rod(8, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows)
+    before, seen = cable.motion(explanation()), np.where(np.isfinite(windows.observed), windows.observed, 0.0)
+    off = np.where(np.isfinite(windows.observed), before - seen, 0.0)
+    # the part of the squared error that goes
+    nearer = before - (1 - np.sqrt(1 - better)) * off
+
+    steps = [Step("", True, (explanation(),) * 2, np.ones(4), 0.0), Step("drag", accepted, (), np.ones(4), 0.9)]
+    found: Any = types.SimpleNamespace(
+        cable=cable,
+        steps=steps,
+        everything=types.SimpleNamespace(with_only=lambda names: explanation()),
+        unseen=lambda names=None: (nearer if names is None else before, np.zeros(len(windows), int)),
+    )
+    says = judge(found, 1.0)
+    assert says.verdict == verdict and says.undecided == (verdict == "unknown") and not says.effects
+    if says.undecided:
+        assert says.share == pytest.approx(better, abs=0.02) and says.gap.after_rmse_mm < says.gap.before_rmse_mm
+        text = hidden_sentence(says.gap)
+        assert "cannot be told" in text and f"from {says.gap.before_rmse_mm:.1f} to" in text
 
 
 @pytest.mark.parametrize("better", ["", "stiffness_profile"])
