@@ -2,10 +2,10 @@
 
     python experiments/34_fresh_cables.py --cables 1540:1580 --executor 2   # for tuning; resumable, minutes each
     python experiments/34_fresh_cables.py --calibrate       # their `spatial.estimate.UNMODELLED`
-    python experiments/34_fresh_cables.py --cables 1700:1740 --executor 2   # those of the page
+    python experiments/34_fresh_cables.py --cables 1700:1740 --executor 2   # those of the page, and 1740:1752
     python experiments/34_fresh_cables.py --report docs/results/fresh_cables.md
 
-Every cable has each of five effects with a chance of one half. It is simulated by a rod that has more than is fitted
+Every cable has each of five effects with a chance of one half, twelve have none. It is simulated by a rod that has more than is fitted
 (odd seeds) or by links on ball joints in MuJoCo (even seeds), seen through noise, with accidents, and handed to the
 protocol of the real recordings: repairs, windows, search, fits to both halves of the recordings, estimates from each
 half and from all.
@@ -19,6 +19,7 @@ import functools
 import math
 import os
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,8 @@ from rows import Rows, made_on
 
 HELD_OUT = range(1700, 1740)
 """Seeds of the page: nothing is chosen on these cables."""
+BARE = range(1740, 1752)
+"""Likewise, of cables that have none of the effects."""
 TRIALS = Path("docs") / "results" / "trials" / "fresh_cables.jsonl"
 LAWS: tuple[tuple[Law, str], ...] = (("richer", "the rod"), ("composite", "MuJoCo"))
 """The two simulators, and their names on the page."""
@@ -82,6 +85,8 @@ def duration_of(seed: int) -> float:
 
 def present_in(seed: int) -> list[str]:
     """Which of `EFFECTS` the cable has."""
+    if seed in BARE:
+        return []
     chosen = np.random.default_rng((seed, 3)).random(len(EFFECTS)) < 0.5
     return [name for name, there in zip(EFFECTS, chosen, strict=True) if there]
 
@@ -132,6 +137,7 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
         "moved_mm": moved,
         "repairs": len(repairs),
         "verdict": says.verdict,
+        "undecided": says.undecided,
         "effects": effects,
         "reported": reported,
         # of all effects, there or not, named or not, without `UNMODELLED`
@@ -246,6 +252,37 @@ def by_bends(rows: list[dict[str, Any]]) -> list[str]:
     return markdown_table(table)
 
 
+def without_effects(bare: list[dict[str, Any]]) -> list[str]:
+    """What is said of the cables that have no effect: a section, empty where none is done."""
+    done = [row for row in bare if "broken" not in row]
+    if not done:
+        return []
+    table = [["cables", "number", "named", "verdicts", "error [mm], median"]]
+    for word, of in (*((word, [r for r in done if r["law"] == law]) for law, word in LAWS), ("all", done)):
+        words = Counter(f"{row['verdict']}{', undecided' * row['undecided']}" for row in of)
+        named = sum(bool(named_in(row["effects"])) for row in of)
+        error = np.median([row["error_mm"][0] for row in of]) if of else np.nan
+        table.append(
+            [
+                word,
+                str(len(of)),
+                str(named),
+                ", ".join(f"{n} {text}" for text, n in words.most_common()),
+                f"{error:.1f}",
+            ]
+        )
+    return [
+        "## Cables without an effect",
+        "",
+        f"Seeds {BARE.start} to {BARE.stop - 1}, drawn and seen likewise, with none of the five effects "
+        f"({len(bare) - len(done)} could not be simulated). Those of the rod keep their rest curvature, markers off the "
+        'centreline and rolling grippers, so that "unknown" is right for them where these show.',
+        "",
+        *markdown_table(table),
+        "",
+    ]
+
+
 def halves_apart(row: dict[str, Any]) -> float:
     """Ratio of EI / rho from the two halves of the recordings, beyond one."""
     return max(row["halves"]) / min(row["halves"]) - 1
@@ -320,6 +357,7 @@ def page(rows: list[dict[str, Any]], every: list[dict[str, Any]], made: str) -> 
         "",
         *by_bends(rows),
         "",
+        *without_effects([row for row in every if row["seed"] in BARE]),
         "## Every cable",
         "",
         *markdown_table(
@@ -366,7 +404,8 @@ def main() -> None:
         publish(page(done, every, made_on(options.trials)), options.report)
         return
     if options.calibrate:
-        chosen_on = [row for row in rows.read() if row["seed"] not in HELD_OUT and "broken" not in row]
+        held_out = {*HELD_OUT, *BARE}
+        chosen_on = [row for row in rows.read() if row["seed"] not in held_out and "broken" not in row]
         print("\n".join(calibration(chosen_on)))
         return
     wanted = [(seed,) for seed in range(*map(int, options.cables.split(":")))]
