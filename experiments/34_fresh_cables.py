@@ -5,10 +5,10 @@
     python experiments/34_fresh_cables.py --cables 1700:1740 --executor 2   # those of the page, and 1740:1752
     python experiments/34_fresh_cables.py --report docs/results/fresh_cables.md
 
-Every cable has each of five effects with a chance of one half, twelve have none. It is simulated by a rod that has more than is fitted
-(odd seeds) or by links on ball joints in MuJoCo (even seeds), seen through noise, with accidents, and handed to the
-protocol of the real recordings: repairs, windows, search, fits to both halves of the recordings, estimates from each
-half and from all.
+Every cable has each of five effects with a chance of one half; twelve have none. It is simulated by a rod that has more
+than is fitted (odd seeds) or by links on ball joints in MuJoCo (even seeds), seen through noise, with accidents, and
+handed to the protocol of the real recordings: repairs, windows, search, fits to both halves of the recordings,
+estimates from each half and from all.
 """
 
 from __future__ import annotations
@@ -275,8 +275,8 @@ def without_effects(bare: list[dict[str, Any]]) -> list[str]:
         "## Cables without an effect",
         "",
         f"Seeds {BARE.start} to {BARE.stop - 1}, drawn and seen likewise, with none of the five effects "
-        f"({len(bare) - len(done)} could not be simulated). Those of the rod keep their rest curvature, markers off the "
-        'centreline and rolling grippers, so that "unknown" is right for them where these show.',
+        f"({len(bare) - len(done)} could not be simulated). Those of the rod keep their rest curvature, markers off "
+        'the centreline and rolling grippers, so that "unknown" is right for them where these show.',
         "",
         *markdown_table(table),
         "",
