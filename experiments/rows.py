@@ -102,12 +102,21 @@ def _made(make: Callable[..., Any], *key: Any) -> tuple[Any, str]:
     return make(*key), f"{versions()}; {machine()}"
 
 
-def made_on(path: str | os.PathLike[str]) -> str:
-    """Versions and machine that made the rows of a file, in a sentence; each with its count where there are several."""
-    counts = Counter(row.get(MADE_ON, "versions and machine were not kept") for row in read_rows(path))
+def made_on(path: str | os.PathLike[str], by: Callable[[dict[str, Any]], str] | None = None) -> str:
+    """Versions and machine that made the rows of a file, in a sentence.
+
+    Where there are several, each comes with its count, and with what `by` says of its rows.
+    """
+    rows = [(row.get(MADE_ON, "versions and machine were not kept"), by and by(row)) for row in read_rows(path)]
+    counts = Counter(where for where, _ in rows)
     if len(counts) == 1:
         return f"{next(iter(counts))}."
-    return " ".join(f"{count} rows: {where}." for where, count in counts.most_common())
+
+    def whose(where: str) -> str:
+        values = sorted({value for other, value in rows if other == where and value})
+        return f" ({', '.join(values)})" if values else ""
+
+    return " ".join(f"{count} rows{whose(where)}: {where}." for where, count in counts.most_common())
 
 
 def append_row(path: str | os.PathLike[str], row: Mapping[str, Any]) -> None:

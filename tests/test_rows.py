@@ -71,3 +71,5 @@ def test_rows_say_where_they_were_made(tmp_path):
     assert here == f"{versions()}; {machine()}."
     append_row(rows.path, {"letter": "c", "number": 1})
     assert made_on(rows.path) == f"4 rows: {here} 1 rows: versions and machine were not kept."
+    whose = made_on(rows.path, by=lambda row: "by hand" if len(row) < 3 else "")
+    assert whose == f"4 rows: {here} 1 rows (by hand): versions and machine were not kept."

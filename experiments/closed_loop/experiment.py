@@ -17,6 +17,7 @@ from cablejax.dynamics.weights import FILE_NAME
 from cablejax.mpc import MPCConfig
 from closed_loop import interval_tables, tables
 from closed_loop.cases import NEARBY, NEARBY_RATIOS
+from closed_loop.cells import label_of
 from closed_loop.failures import failure_figure, worst
 from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
 from closed_loop.harder import MARGIN_CM
@@ -112,7 +113,7 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None
         if snapshots := [snapshot for snapshot in pictures if snapshot.key in shown]:
             failure_figure(worst(snapshots, WORST)).savefig(picture, dpi=110, bbox_inches="tight")
     name = picture.name if picture is not None and picture.exists() else None
-    made = made_on(folder / TRIALS)
+    made = made_on(folder / TRIALS, by=lambda row: label_of(row["method"]))
     publish(page(experiment, trials, command(experiment, options), made, picture=name), options.report)
 
 
