@@ -114,7 +114,7 @@ def made_on(path: str | os.PathLike[str], by: Callable[[dict[str, Any]], str] | 
 
     def whose(where: str) -> str:
         values = sorted({value for other, value in rows if other == where and value})
-        return f" ({', '.join(values)})" if values else ""
+        return f" ({'; '.join(values)})" if values else ""
 
     return " ".join(f"{count} rows{whose(where)}: {where}." for where, count in counts.most_common())
 
