@@ -137,7 +137,7 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
         "moved_mm": moved,
         "repairs": len(repairs),
         "verdict": says.verdict,
-        "undecided": says.undecided,
+        "undecided": says.hidden is not None,
         "effects": effects,
         "reported": reported,
         # of all effects, there or not, named or not, without `UNMODELLED`

@@ -100,6 +100,22 @@ def test_a_failing_controller_loses_nothing():
     assert "It stopped after 2 s" in run.verdict()
 
 
+class Silent(Plant):
+    """Loses its encoders after two seconds."""
+
+    def record(self, twist, interval, *, samples):
+        seen = super().record(twist, interval, samples=samples)
+        lost = np.full((2, 3), np.nan)
+        return [one if one.time < 2.5 else dataclasses.replace(one, gripper_pose=lost) for one in seen]
+
+
+def test_a_plant_that_falls_silent_loses_nothing():
+    target = make_target("U", CABLE.cable)
+    run = run_closed_loop(Silent(CONFIG), GoToPose(target.gripper_pose), target, 9, start=straight_start(CABLE.cable))
+    assert run.stopped is not None and "The observations of the plant cannot be used" in run.stopped
+    assert 1 <= len(run.times) <= 4 and np.isfinite(run.error_cm).all()
+
+
 def test_a_run_whose_end_was_hardly_seen_is_not_a_success():
     target = make_target("U", CABLE.cable)
     run = run_closed_loop(

@@ -140,7 +140,7 @@ def test_effects_targets_and_random_parameters_change_the_episode():
     plain = rollout(env, actions, target="S")
     again = rollout(env, actions, target="S", effects=["bending_stiffness:ratio=0.1", "table_friction:coefficient=0.5"])
     shift = np.abs(again - plain).max(axis=(1, 2))
-    # it lies there anew, with other rounding
+    # other parameters, and the cable has come to rest with them
     assert shift[0] < 1e-6 and shift[-1] > 1e-3
     np.testing.assert_array_equal(env.reset(options={"target": "U"})[0]["target"].shape, (7, 2))
     varied = ShapeCableEnv(dataclasses.replace(clean(), randomisation=Randomisation(stiffness=(0.1, 0.2))))
@@ -190,6 +190,17 @@ def test_the_vector_form_is_many_of_the_single_one():
             np.testing.assert_allclose(rewards, [one[1] for one in each], atol=1e-5)
         np.testing.assert_allclose(seen["keypoints"], [one[0]["keypoints"] for one in each], atol=1e-4)
         assert info["target_name"].tolist() == [one[-1]["target_name"] for one in each]
+
+
+def test_a_reset_without_the_configured_effects_is_one_of_the_nominal_cable():
+    bent = clean(targets=("U",), effects=("intrinsic_curvature:centre_m=0.3,width_m=0.2,curvature_per_m=5",))
+    still = np.zeros((2, 2, 3))
+    shown = [
+        rollout(ShapeCableEnv(one), still, effects=effects)
+        for one, effects in ((bent, []), (dataclasses.replace(bent, effects=()), None), (bent, None))
+    ]
+    np.testing.assert_allclose(shown[0], shown[1], atol=1e-5)
+    assert np.abs(shown[2] - shown[1]).max() > 0.01 and np.abs(np.diff(shown[2], axis=0)).max() < 1e-3
 
 
 @pytest.mark.parametrize("value", [np.nan, 1e20])

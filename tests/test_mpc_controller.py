@@ -239,6 +239,18 @@ def test_what_was_not_observed_is_no_evidence_that_the_model_is_right():
         assert (float(after.progress.best_error) == best) == blind
 
 
+def test_commands_whose_outcome_is_not_seen_did_not_fail():
+    """A controller that saw nothing for a while gave up, near its target or far from it."""
+    control, cable = controller(), Cable(rate=0.8, sag=0.0)
+    state = control.init(at_rest(START))
+    state, twist, _ = control.step(state, Measurement(cable.keypoints, cable.pose))
+    for _ in range(CONFIG.restart_after + 2):
+        cable.step(twist)
+        state, twist, info = control.step(state, Measurement(np.full((N, 2), np.nan), cable.pose))
+        assert Action(int(info.action)) in (Action.FOLLOW, Action.HOLD) and int(state.progress.mode) == Action.FOLLOW
+    assert int(state.progress.since) <= 1 and int(state.progress.restarts) == 0
+
+
 def test_a_twist_that_is_not_known_is_the_commands():
     control, cable = controller(config=dataclasses.replace(CONFIG, max_change=0.02)), Cable()
     state = control.init(at_rest(START))

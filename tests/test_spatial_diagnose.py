@@ -186,11 +186,14 @@ def test_a_gap_that_amplified_noise_hides_is_undecided(monkeypatch, better, acce
         unseen=lambda names=None: (nearer if names is None else before, np.zeros(len(windows), int)),
     )
     says = judge(found, 1.0)
-    assert says.verdict == verdict and says.undecided == (verdict == "unknown") and not says.effects
-    if says.undecided:
-        assert says.share == pytest.approx(better, abs=0.02) and says.gap.after_rmse_mm < says.gap.before_rmse_mm
-        text = hidden_sentence(says.gap)
-        assert "cannot be told" in text and f"from {says.gap.before_rmse_mm:.1f} to" in text
+    assert says.verdict == verdict and not says.effects and says.gap.shrinkage is None
+    if says.hidden is None:
+        assert verdict == "none"
+        return
+    assert says.hidden.shrinkage == pytest.approx(better, abs=0.02)
+    assert f"from {says.hidden.before_rmse_mm:.1f} to {says.hidden.after_rmse_mm:.1f} mm" in hidden_sentence(
+        says.hidden
+    )
 
 
 @pytest.mark.parametrize("better", ["", "stiffness_profile"])

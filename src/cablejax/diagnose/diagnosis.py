@@ -219,7 +219,7 @@ class Diagnosis:
         equivalent: sets of effects that are indistinguishable on this log.
         ranking: every effect tried, most probable first; of a forward search, every trial in order.
         undecided: whether the verdict is "unknown" because the log shows too little of the gap: effects of the library
-            would explain it, and none can be named.
+            would explain it, and none can be named. In space, also where amplified noise hides whether there is one.
         leftover_p: chance that a right explanation leaves as much error as the best one, see `belief.leftover_p`; None
             without a gap, or without labelled logs like this one.
         gap: before and after.

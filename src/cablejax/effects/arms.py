@@ -152,7 +152,7 @@ def delayed(values: Any, samples: Any) -> Any:
 def _recursion(xp: Any, decay: Any, driven: Any) -> Any:
     """`y_k = decay y_(k - 1) + driven_k`, from `y_0 = 0` on."""
     if xp is np:
-        result, last = np.empty_like(driven), np.zeros_like(driven[0])
+        result, last = np.empty_like(driven), np.zeros(driven.shape[1:], driven.dtype)
         for k in range(len(driven)):
             last = result[k] = decay * last + driven[k]
         return result

@@ -12,6 +12,7 @@ from cablejax.arrays import real
 from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import Shape, Target, straight_start
 from cablejax.dataset.drawing import cable_params, draw_parameters
+from cablejax.dataset.schema import Randomisation
 from cablejax.effects.camera import without_bias
 from cablejax.effects.physics import Physics
 from cablejax.environment.config import EffectText, ShapeCableConfig
@@ -44,6 +45,8 @@ class Cables:
         drawn = cable_params(self._recipe, draw_parameters(self._recipe, np.random.default_rng(0)))
         one = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[None], drawn)
         self._start, self._shown = self._at_rest(one)
+        if not np.isfinite(self._shown).all():
+            raise ValueError(self._diverges)
 
         def rows(leaf):
             return np.repeat(np.asarray(leaf), size, axis=0)
@@ -57,21 +60,20 @@ class Cables:
         self.names = [""] * size
 
     def _at_rest(self, physics: Physics) -> tuple[CableState, Float[np.ndarray, "2 N 2"]]:
-        """One cable before its first action: its state, its true and its seen keypoints [m].
-
-        Raises:
-            ValueError: it diverges there.
-        """
-        start = self._engine.settled(physics, self._laid)
+        """One cable before its first action: its state, its true and its seen keypoints [m]; NaN where it diverges."""
+        start = self._engine.settled(physics, self._laid, self.config.interval)
         rest = self._engine.rollout(physics, start, np.zeros((1, 1, 2, 3)))[1]
-        if not np.isfinite(rest.keypoints).all():
-            raise ValueError(
-                f"The simulation of this cable by {self.config.discretisation.n_links} links diverges at rest. Check "
-                "the numbers of the cable and of its effects, and their units, or take a discretisation with fewer "
-                "links (n_links)."
-            )
         true = self._engine.keypoints(without_bias(physics), start)
-        return start, np.stack([np.asarray(true[0]), np.asarray(rest.keypoints[0, 0])])
+        shown = np.stack([np.asarray(true[0]), np.asarray(rest.keypoints[0, 0])])
+        return start, shown if np.isfinite(rest.keypoints).all() else np.full_like(shown, np.nan)
+
+    @property
+    def _diverges(self) -> str:
+        return (
+            f"The simulation of this cable by {self.config.discretisation.n_links} links diverges at rest. Check the "
+            "numbers of the cable and of its effects, and their units, or take a discretisation with fewer links "
+            "(n_links)."
+        )
 
     def reset(
         self,
@@ -90,7 +92,8 @@ class Cables:
             effects: by default the configuration's.
 
         Raises:
-            ValueError: the target does not fit the cable, or see `ShapeCableConfig.recipe`.
+            ValueError: the target does not fit the cable, a cable with these effects diverges at rest, or see
+                `ShapeCableConfig.recipe`.
         """
         config = self.config
         drawn = self._targets[random.integers(len(self._targets))]
@@ -98,8 +101,15 @@ class Cables:
         recipe = self._recipe if effects is None else config.recipe(effects)
         physics = cable_params(recipe, draw_parameters(recipe, random))
         batch = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[None], physics)
+        start, shown = self._start, self._shown
         # without effects all cables lie alike, whatever their parameters
-        start, shown = self._at_rest(batch) if recipe.effects else (self._start, self._shown)
+        if recipe.effects != self._recipe.effects or (recipe.effects and config.randomisation != Randomisation()):
+            rested, seen = self._at_rest(batch)
+            if np.isfinite(seen).all():
+                start, shown = rested, seen
+            elif effects is not None:
+                raise ValueError(self._diverges)
+            # one that was drawn ends its own episode, with its first action
 
         def put(whole, leaf):
             whole[row] = leaf

@@ -83,7 +83,11 @@ class MjxShapeCable:
         target = jnp.asarray(self._targets)[jax.random.randint(choice, (), 0, len(self._targets))]
         start, zero = self._laid, jnp.zeros(())
         if self._recipe.effects:
-            start = self._engine.settled(self._known(physics), start, self.config.interval)
+            rested = self._engine.settled(self._known(physics), start, self.config.interval)
+            # one that diverges there ends its episode with its first action
+            sound = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(rested)]).all()
+            laid = dataclasses.replace(start, memory=jax.tree.map(jnp.zeros_like, rested.memory))
+            start = jax.tree.map(lambda new, old: jnp.where(sound, new, old), rested, laid)
         true = self._engine.keypoints(without_bias(physics), start)
         seen, _ = self._moved(physics, start, jnp.zeros((2, 3)))[1]
         rng, obs, error = self._observed(rng, true, seen, start, target)

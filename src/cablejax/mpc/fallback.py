@@ -78,7 +78,8 @@ def plan_or_recover(
       half the bound on their motion (`radius_after`): a trust region's rejected step. They rest there after `RETURNS`
       ways back.
 
-    An error that is mostly of predicted keypoints, `seen` being false, is no better one.
+    Where the shape was not observed (`seen` false), the error is that of a prediction: it is not taken for the lowest
+    so far, and the command does not count as one that failed to lower it.
     """
     plan, sound = decision.plan, _sound(decision.plan.result)
     held = decision.action == Action.HOLD
@@ -127,7 +128,8 @@ def _followed(
     planning = (before.mode == Action.FOLLOW) | woken
     best = jnp.where(woken, jnp.inf, before.best_error)
     better = planning & seen & (error < 0.99 * best)
-    since = jnp.where(better | woken, 0, before.since + 1)
+    # commands whose outcome was not observed did not fail
+    since = jnp.where(better | woken, 0, before.since + (seen | ~planning))
 
     far = error > config.restart_above
     tired = planning & sound & ((far & held) | (since >= jnp.where(far, config.restart_after, config.settle_after)))

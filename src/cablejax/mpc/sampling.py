@@ -52,15 +52,8 @@ class CrossEntropy(_Sampling):
         def iterate(carry, key):
             best, mean, deviation = carry
             drawn = drawn_plans(problem, key, mean, deviation, self.samples)
-            order = jnp.argsort(drawn.value)[:_ELITES]
-            # plans of which the model gives NaN are no elite
-            known = jnp.isfinite(drawn.value[order])
-            weight = known / jnp.maximum(known.sum(), 1)
-            centre = jnp.tensordot(weight, drawn.motion[order], axes=1)
-            spread = jnp.sqrt(jnp.tensordot(weight, (drawn.motion[order] - centre) ** 2, axes=1))
-            kept = jnp.where(known.any(), _SMOOTHING, 1.0)
-            mean, deviation = kept * mean + (1 - kept) * centre, kept * deviation + (1 - kept) * spread
-            return (better_plan(best, drawn, order[0]), mean, deviation), None
+            mean, deviation = towards_the_best(mean, deviation, drawn)
+            return (better_plan(best, drawn, jnp.argmin(drawn.value)), mean, deviation), None
 
         first = first_plan(problem, guess)
         deviation = _ELITE_SPREAD * problem.feasible.radius * jnp.ones_like(guess.motion)
@@ -126,6 +119,17 @@ def drawn_plans(problem: ShapingProblem, key: Array, mean: Array, deviation: Arr
     motion = jax.lax.cond(outside.any(), jax.vmap(problem.feasible.project), lambda motion: motion, motion)
     value = jax.vmap(problem.value)(motion)
     return Valued(motion, jnp.where(jnp.isfinite(value), value, jnp.inf))
+
+
+def towards_the_best(mean: Array, deviation: Array, drawn: Valued) -> tuple[Array, Array]:
+    """The cross-entropy method's next mean and spread; as they are where no plan has a value."""
+    order = jnp.argsort(drawn.value)[:_ELITES]
+    known = jnp.isfinite(drawn.value[order])
+    weight = (known / jnp.maximum(known.sum(), 1)).astype(mean.dtype)
+    centre = jnp.tensordot(weight, drawn.motion[order], axes=1)
+    spread = jnp.sqrt(jnp.tensordot(weight, (drawn.motion[order] - centre) ** 2, axes=1))
+    kept = jnp.where(known.any(), _SMOOTHING, 1.0).astype(mean.dtype)
+    return kept * mean + (1 - kept) * centre, kept * deviation + (1 - kept) * spread
 
 
 def better_plan(best: Valued, drawn: Valued, index: Array) -> Valued:

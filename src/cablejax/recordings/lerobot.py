@@ -23,7 +23,7 @@ import numpy as np
 from cablejax.extras import from_extra
 from cablejax.gaplog import Episode, episodes_of, labels, stack_episodes
 from cablejax.gaplog_check import SCHEMA, GapLogError, meta_text, reading_export
-from cablejax.limits import require, shown
+from cablejax.limits import require
 from cablejax.text_file import read_json, write_json
 from cablejax.types import GapLog
 from cablejax.whole_file import draft_folder, whole_file
@@ -209,16 +209,12 @@ def _info(log: GapLog, features: Mapping[str, Any], frames: int, tasks: int) -> 
 def _splits(split: Sequence[str]) -> dict[str, str]:
     """First episode and the one after the last of each split, by its name; what has none is for training.
 
-    Raises:
-        GapLogError: the episodes of a split do not follow one another.
+    Where the episodes of a split do not follow one another, which the format cannot state, all are one split, "all".
     """
     names = [name or "train" for name in split]
     begins = [e for e, name in enumerate(names) if e == 0 or name != names[e - 1]]
     if len(begins) > len(set(names)):
-        raise GapLogError(
-            f"Field 'meta.split' is {shown(list(split))}: a LeRobot data set has one range of episodes for each split. "
-            "Export each split by itself, with `gaplog_join.chosen`."
-        )
+        return {"all": f"0:{len(names)}"}
     ends = [*begins[1:], len(names)]
     return {names[begin]: f"{begin}:{end}" for begin, end in zip(begins, ends, strict=True)}
 

@@ -176,7 +176,7 @@ def _works(diagnosis: CableDiagnosis) -> str:
     elif diagnosis.effects:
         said = "This log cannot show it, since no motion was held out of the fit: record a second motion."
     elif diagnosis.undecided:
-        said = "Not on this log: effects of the library would explain the gap, but it shows too little to name one."
+        said = "Not on this log: effects of the library would explain it, but it shows too little to name one."
     else:
         said = "Not on this log: no effect of the library explains enough of the gap, so none is named."
     return f"{said} This verdict has {counted(limits, 'limit')}: see the end of the page." if limits else said

@@ -91,7 +91,7 @@ class Engine(abc.ABC):
         """
 
     def settled(self, physics: Physics, state: CableState, interval: float = 1.0) -> CableState:
-        """A cable that was laid out as in `state`, once it lies as its effects and the table's friction leave it.
+        """A cable on a table, laid out as in `state`, once it lies as its effects and the friction leave it.
 
         `initial_state` is that of the nominal cable: without this, the first command would carry the jump to the shape
         in which a cable of another rest curvature, or in clamps that are askew, lies.
@@ -99,14 +99,17 @@ class Engine(abc.ABC):
         Args:
             physics: as of `rollout`. Nothing slips and no arm moves before the first command.
             state: where the cable is laid.
-            interval: any duration of commands [s], a multiple of the time step.
+            interval: any duration of commands [s], a multiple of the time step: it lies for whole ones, 3 s or more.
         """
         count = math.ceil(_SETTLING / interval)
         # NumPy: known to be zero, also where a caller traces the physics
         idle = {name: np.zeros(np.shape(getattr(physics, name)), np.float32) for name in ("slip", *_LAGS)}
         still = np.zeros((*state.gripper_pose.shape[:-2], count, 2, 3 if self.config.dimension == 2 else 6))
         rested = self.rollout(dataclasses.replace(physics, **idle), state, still, interval)[0]
-        memory = None if rested.memory is None else dataclasses.replace(rested.memory, time=0.0 * rested.memory.time)
+        memory = rested.memory
+        if memory is not None:
+            still = jnp.zeros_like(memory.time)
+            memory = dataclasses.replace(memory, time=still, stretch_rate=still)
         return dataclasses.replace(rested, qvel=jnp.zeros_like(rested.qvel), memory=memory)
 
     def substeps(self, interval: float) -> int:

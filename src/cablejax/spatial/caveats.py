@@ -16,12 +16,13 @@ STIFF = 3.0
 """A cable that is not so many times longer than the length over which it bends is held up by its grippers."""
 
 
-def hidden_sentence(gap: Gap) -> str:
-    """The verdict on a cable whose nominal simulation amplifies noise too much to be judged."""
+def hidden_sentence(hidden: Gap) -> str:
+    """The verdict on a cable whose nominal simulation amplifies noise too much to be judged, see `Judgement.hidden`."""
     return (
-        "Whether the simulator is wrong about this cable cannot be told: it amplifies noise until it is as far off "
-        f"itself as from the recording. With effects of the library the error falls from {gap.before_rmse_mm:.1f} to "
-        f"{gap.after_rmse_mm:.1f} mm, more than by the noise alone: record calmer motions."
+        "This recording does not show whether the simulator is wrong: the nominal cable amplifies noise until two "
+        "simulations of it are as far apart as one is from the recording. All effects of the library together lessen "
+        f"the error from {hidden.before_rmse_mm:.1f} to {hidden.after_rmse_mm:.1f} mm, which noise alone would not: "
+        "record calmer motions."
     )
 
 

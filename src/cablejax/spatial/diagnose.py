@@ -84,14 +84,14 @@ def diagnose_space(
     counted, after = windows.chosen(says.use), says.after[says.use]
     cut = _seconds(says.compared.windows) if says.compared.windows.valid.sum() < counted.valid.sum() else None
     sentence = verdict_sentence(says.verdict, says.effects, says.equivalent, says.share)
-    if says.undecided:
-        sentence = hidden_sentence(says.gap)
+    if says.hidden is not None:
+        sentence = hidden_sentence(says.hidden)
     offset = ParameterEstimate(constant_offset(after, counted), None, "m")
     where = where_of(log, counted, says.before[says.use], noise, says.smallest, changes)
     nominal, explained = (in_log(log, windows, part) for part in (says.before, says.after))
     return SpatialDiagnosis(
         verdict=says.verdict,
-        undecided=says.undecided,
+        undecided=says.hidden is not None,
         sentence=" ".join([sentence, *changes[:1], *shifted]),
         effects=says.effects,
         equivalent=says.equivalent,

@@ -35,8 +35,9 @@ class Judgement:
         effects: that are named: those that the estimates show, where they lessen the gap; else none.
         equivalent: names that take each other's place equally well.
         gap: before and after, in the windows that count.
-        undecided: whether the nominal cable amplifies noise too much to show a gap, although effects of the library
-            lessen its error by more than that would; the verdict is "unknown" then.
+        hidden: where the nominal cable amplifies noise too much to show a gap, although effects of the library lessen
+            its error by more than that would: error before and with all of them together, as if it had no error by
+            itself. The verdict is "unknown" then; else None.
         share: of the squared gap that goes away: with the named effects, or of an unknown cause with all together.
         before, after: motion of the nominal cable, and of that with what the estimates show [m].
         results: how the latter's rollouts ended.
@@ -52,7 +53,7 @@ class Judgement:
     effects: tuple[NamedEffect, ...]
     equivalent: tuple[tuple[str, ...], ...]
     gap: Gap
-    undecided: bool
+    hidden: Gap | None
     share: float
     before: Float[np.ndarray, "W T F 3"]
     after: Float[np.ndarray, "W T F 3"]
@@ -84,20 +85,19 @@ def judge(found: Identified, density: float) -> Judgement:
     explaining = found.everything.with_only(with_both_drags(named))
     own_after = own_error(compared, explaining, compared.motion(explaining), noise)
     verdict = _verdict(gap, 1e3 * smallest_gap(noise, windows, own_after), named, equivalent)
-    share, undecided = gap.shrinkage, False
+    share, hidden = gap.shrinkage, None
     if verdict == "unknown":  # each effect may be absent: by all of them together
         share = gap_of(before[use], found.unseen()[0][use], compared, noise, smallest).shrinkage
     elif verdict == "none" and any(step.accepted for step in found.steps[1:]):
-        # as if the nominal cable had no error of its own
         seen = gap_of(before[use], found.unseen()[0][use], compared, noise, smallest_gap(noise, windows))
         if seen.shrinkage_ci90 is not None and seen.shrinkage_ci90[0] > AVERAGED:
-            verdict, undecided, gap, share = "unknown", True, seen, seen.shrinkage
+            verdict, hidden = "unknown", seen
     return Judgement(
         verdict=verdict,
         effects=() if verdict in ("none", "unknown") else effects,
         equivalent=equivalent,
         gap=gap,
-        undecided=undecided,
+        hidden=hidden,
         share=share or 0.0,
         before=before,
         after=after,
