@@ -275,8 +275,9 @@ def without_effects(bare: list[dict[str, Any]]) -> list[str]:
         "## Cables without an effect",
         "",
         f"Seeds {BARE.start} to {BARE.stop - 1}, drawn and seen likewise, with none of the five effects "
-        f"({len(bare) - len(done)} could not be simulated). Those of the rod keep their rest curvature, markers off "
-        'the centreline and rolling grippers, so that "unknown" is right for them where these show.',
+        f"({len(bare) - len(done)} could not be simulated). As the others they carry markers, of a mass that is not "
+        "stated and some millimetres off their stated places; those of the rod have a rest curvature, markers off the "
+        'centreline and rolling grippers, too. Where these show, "unknown" is right. Named counts any of the five.',
         "",
         *markdown_table(table),
         "",
