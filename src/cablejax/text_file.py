@@ -6,7 +6,6 @@ import difflib
 import json
 import os
 import pathlib
-import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,9 +14,6 @@ import numpy as np
 
 from cablejax.limits import require, shown
 from cablejax.whole_file import whole_file
-
-# What is left of a key without the name of its quantity.
-_UNIT = re.compile(r"(_(m|m2|kg|s|n|rad|per))+")
 
 
 def write_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
@@ -157,12 +153,17 @@ def unknown_key(key: str, units: Mapping[str, str]) -> str:
         key: that is unknown.
         units: of every key that is known; keys of quantities end in their unit.
     """
-    if bare := [known for known in units if _UNIT.fullmatch(known.removeprefix(key))]:
+    if bare := [known for known, unit in units.items() if unit and known == f"{key}_{_in_key(unit)}"]:
         return f"{key} without its unit: write {bare[0]}, in {units[bare[0]]}."
     near = [known for known in units if key and key in known]
     near = near or difflib.get_close_matches(key, units, 1, 0.5)
     known = f"Did you mean {near[0]}?" if near else f"Expected {', '.join(units)}."
     return f"the unknown key {shown(key)}. {known}"
+
+
+def _in_key(unit: str) -> str:
+    """A unit as the end of a key has it: "n_m2" of "N m^2", "per_m" of "1/m"."""
+    return unit.lower().replace("1/", "per_").replace("/", "_per_").replace(" ", "_").replace("^", "")
 
 
 def version_of(schema: object, known: str, where: object) -> int:
