@@ -369,7 +369,7 @@ def space(tmp_path_factory):
         },
         leftover_p=None,
         gap=gap_of(before, after, cable, noise, smallest_gap(noise, cable.windows)),
-        where=where_of(log, windows, nominal, before, noise, smallest_gap(noise, windows), ()),
+        where=where_of(log, windows, before, noise, smallest_gap(noise, windows), ()),
         next_motion=None,
         baselines={},
         caveats=(),

@@ -173,7 +173,7 @@ def register(
 
     # The turn is made up for at once, evenly: the iterations then only have to close the remaining gap.
     turn = (gripper_pose[1, 2] - gripper_pose[0, 2]) - jnp.sum(angles)
-    angles = angles + turn / config.n_links
+    angles = angles + turn / len(angles)
     (angles, sigma), _ = jax.lax.scan(iterate, (angles, jnp.asarray(sigma, dtype)), length=iterations)
     return _assess(config, points, mask, angles, gripper_pose, sigma, reach)
 
