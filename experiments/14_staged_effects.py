@@ -39,8 +39,8 @@ TWISTS = np.array(
 """Commands [m/s, rad/s], each held for `INTERVAL`."""
 INTERVAL, SAMPLES = 1.5, 10
 """Duration of a command [s], and observations during it."""
-SLOW = np.tile([0.0, 3e-3, 0.0], (4, 2, 1))
-"""Commands that drag the cable across the table so slowly that it sticks and slips."""
+SLOW = np.repeat(0.08 * TWISTS[:1], 3, axis=0)
+"""Commands that drag the cable so slowly that it sticks and slips."""
 EFFECTS = (
     "bending_stiffness:ratio=4",
     "stiffness_profile:centre_m=0.3,width_m=0.2,ratio=0.3",
@@ -146,8 +146,8 @@ def _size(change: Float[np.ndarray, "T N 2"]) -> float:
 
 def page(table: Sequence[Change]) -> str:
     """The page: the table, and two cases of friction that it does not show."""
-    excess = parse_effect("table_friction:coefficient=0.5,static_excess=1")
-    (slow,) = changes((excess,), SLOW, (parse_effect("table_friction:coefficient=0.5"),))
+    excess = parse_effect("table_friction:coefficient=0.3,static_excess=1")
+    (slow,) = changes((excess,), SLOW, (parse_effect("table_friction:coefficient=0.3"),))
     (rough,) = changes((parse_effect("table_friction:coefficient=5"),))
     return page_of_results(
         "Every effect in the plant and in the chain",
@@ -161,9 +161,9 @@ def page(table: Sequence[Change]) -> str:
             *markdown_table(rows_of(table)),
             "",
             "This motion is too fast for the cable to stick, so the static excess hardly shows. Dragged at "
-            f"{1e3 * SLOW.max():.0f} mm/s, the excess alone moves the keypoints by {slow.sizes[0]:.2g} mm in the plant "
-            f"and by {slow.sizes[1]:.2g} mm in the chain, at a similarity of {slow.similarity:.3f}. Plant and chain "
-            "disagree at friction coefficients far above 1: at 5, changes are "
+            f"{1e3 * SLOW[..., :2].max():.0f} mm/s, the excess alone moves the keypoints by {slow.sizes[0]:.2g} mm in "
+            f"the plant and by {slow.sizes[1]:.2g} mm in the chain, at a similarity of {slow.similarity:.3f}. Plant "
+            "and chain disagree at friction coefficients far above 1: at 5, changes are "
             f"{rough.sizes[0]:.0f} mm in the plant and {rough.sizes[1]:.0f} mm in the chain, at a similarity of "
             f"{rough.similarity:.2f}.",
         ],
