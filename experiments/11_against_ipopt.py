@@ -95,7 +95,7 @@ def referees(exact: bool) -> list[RefereeConfig]:
 def run(options: argparse.Namespace, cases: list[PlanningCase], folder: Path, executor: Executor | None) -> None:
     """Judges what has no row yet, until the time is up."""
     rows = rows_of(folder)
-    mine = fingerprint(load_model(options.weights).weights)
+    mine = network(options.weights)
     if other := sum(row.get("weights") != mine for row in rows.read()):
         raise SystemExit(
             f"{rows.path} has {other} rows of other weights than {options.weights} has now, and a table is of one "
@@ -114,8 +114,13 @@ def judged(weights: str, folder: Path, exact: frozenset[str], name: str) -> dict
     """The row of one problem."""
     cases, ours = compiled(weights, folder, name in exact)
     row = judge(ours, cases[name], referees(name in exact))
-    weights = fingerprint(load_model(weights).weights)
-    return {**row, "weights": weights, "machine": machine(), "threads": os.environ["NPROC"]}
+    return {**row, "weights": network(weights), "machine": machine(), "threads": os.environ["NPROC"]}
+
+
+@functools.lru_cache
+def network(weights: str) -> str:
+    """Which arrays a model has today."""
+    return fingerprint(load_model(weights).weights)
 
 
 @functools.lru_cache
@@ -183,7 +188,7 @@ def page(options: argparse.Namespace, folder: Path, n_all: int) -> str:
     path, machines = rows_of(folder).path, ", ".join(sorted({row["machine"] for row in rows}))
     kept = any(MADE_ON in row for row in read_rows(path))
     made = made_on(path) if kept else f"Versions were not kept; {machines}."
-    mine = fingerprint(load_model(options.weights).weights)
+    mine = network(options.weights)
     older = "" if all(row.get("weights") == mine for row in rows) else ", as it was released earlier,"
     lines = [
         f"{len(rows)} of {n_all} problems, in a random order, seed 0; {n_exact} of them with the exact Hessian too. "

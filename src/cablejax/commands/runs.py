@@ -159,8 +159,8 @@ def known_from(model: Model, given: Sequence[str], verdicts: Sequence[pathlib.Pa
     known = list(map(parse_effect, given))
     for path in verdicts:
         # about the log's grippers: places do not enter a model, and a robot's world may begin metres away
-        named, *drawn = explanations_of_verdict(path)
-        known += next((effects for effects in (named, *drawn) if enters(model, effects)), named)
+        explanations = explanations_of_verdict(path)
+        known += next((effects for effects in explanations if enters(model, effects)), explanations[0])
     return tuple(known)
 
 

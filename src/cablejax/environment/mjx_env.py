@@ -85,9 +85,8 @@ class MjxShapeCable:
         if self._recipe.effects:
             rested = self._engine.settled(self._known(physics), start, self.config.interval)
             # one that diverges there ends its episode with its first action
-            sound = jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(rested)]).all()
-            laid = dataclasses.replace(start, memory=jax.tree.map(jnp.zeros_like, rested.memory))
-            start = jax.tree.map(lambda new, old: jnp.where(sound, new, old), rested, laid)
+            sound = jnp.isfinite(rested.qpos).all()
+            start = jax.tree.map(lambda new, old: jnp.where(sound, new, old), rested, start)
         true = self._engine.keypoints(without_bias(physics), start)
         seen, _ = self._moved(physics, start, jnp.zeros((2, 3)))[1]
         rng, obs, error = self._observed(rng, true, seen, start, target)

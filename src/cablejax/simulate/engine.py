@@ -108,8 +108,8 @@ class Engine(abc.ABC):
         rested = self.rollout(dataclasses.replace(physics, **idle), state, still, interval)[0]
         memory = rested.memory
         if memory is not None:
-            still = jnp.zeros_like(memory.time)
-            memory = dataclasses.replace(memory, time=still, stretch_rate=still)
+            zero = jnp.zeros_like(memory.time)
+            memory = dataclasses.replace(memory, time=zero, stretch_rate=zero)
         return dataclasses.replace(rested, qvel=jnp.zeros_like(rested.qvel), memory=memory)
 
     def substeps(self, interval: float) -> int:

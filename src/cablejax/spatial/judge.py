@@ -85,11 +85,15 @@ def judge(found: Identified, density: float) -> Judgement:
     explaining = found.everything.with_only(with_both_drags(named))
     own_after = own_error(compared, explaining, compared.motion(explaining), noise)
     verdict = _verdict(gap, 1e3 * smallest_gap(noise, windows, own_after), named, equivalent)
+
+    def together(least: float) -> Gap:
+        return gap_of(before[use], found.unseen()[0][use], compared, noise, least)
+
     share, hidden = gap.shrinkage, None
     if verdict == "unknown":  # each effect may be absent: by all of them together
-        share = gap_of(before[use], found.unseen()[0][use], compared, noise, smallest).shrinkage
+        share = together(smallest).shrinkage
     elif verdict == "none" and any(step.accepted for step in found.steps[1:]):
-        seen = gap_of(before[use], found.unseen()[0][use], compared, noise, smallest_gap(noise, windows))
+        seen = together(smallest_gap(noise, windows))
         if seen.shrinkage_ci90 is not None and seen.shrinkage_ci90[0] > AVERAGED:
             verdict, hidden = "unknown", seen
     return Judgement(
