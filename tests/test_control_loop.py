@@ -191,4 +191,6 @@ def test_shape_error_is_the_root_mean_square_distance():
     ],
 )
 def test_settling_time(error, expected):
-    assert settling_time(np.arange(len(error), dtype=float), np.array(error)) == expected
+    assert settling_time(np.arange(len(error), dtype=float), np.array(error), 1.0) == expected
+    # in a cable of another length everything is in proportion
+    assert settling_time(np.arange(len(error), dtype=float), 0.3 * np.array(error), 0.3) == expected

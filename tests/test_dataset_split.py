@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.control.cable_inputs import inputs_of_training, inputs_of_weights
 from cablejax.dataset.opening import open_or_create
-from cablejax.dataset.schema import Block, DatasetConfig
-from cablejax.dataset.split import read_split, split
+from cablejax.dataset.schema import Block, DatasetConfig, config_to_json
+from cablejax.dataset.split import known_motions, read_split, split
 from cablejax.dataset.streaming import StreamedData, blocks_of
 from cablejax.dataset.windows import concatenate, read_trajectories
+from cablejax.effects.given import parse_effect
 
 
 @pytest.mark.parametrize(("count", "held_out"), [(2, 0.05), (2, 0.99), (20, 0.05), (1000, 0.05), (7, 0.5)])
@@ -77,6 +79,33 @@ def test_what_is_held_out_of_one_store_is_not_trained_on_in_another(tmp_path):
     ):
         read_split([few, many], 0.3)
     read_split([few, few], 0.3)  # twice the weight, and the same are held out
+
+
+def test_what_is_held_out_but_moves_like_what_is_trained_on_is_said(tmp_path):
+    softer = dataclasses.replace(CONFIG, n_trajectories=8, effects=(parse_effect("bending_stiffness:ratio=0.5"),))
+    few, many = open_or_create(tmp_path / "few", CONFIG), open_or_create(tmp_path / "many", softer)
+    (said,) = known_motions([few, many], [1, 2])
+    assert said.startswith(
+        f"1 of the 1 trajectories held out of {few.path} have motions that are trained on in {many.path}"
+    )
+    assert known_motions([few, open_or_create(tmp_path / "b", dataclasses.replace(softer, seed=5))], [1, 2]) == []
+    # those of the model to start from
+    before = {"name": "free", "config": config_to_json(softer), "held_out": 2}
+    (said,) = known_motions([few], [1], [before, {**before, "config": {"schema": "of a version that nobody knows"}}])
+    assert "trained on in free, of the model to start from" in said
+    assert known_motions([few], [1], [{**before, "held_out": 5}]) == []
+
+
+def test_a_conditioned_model_to_start_from_may_still_believe_the_cables_that_it_knows(tmp_path):
+    store = filled(tmp_path / "a", CONFIG)
+    own, more = (inputs_of_training([store], 0.3, start) for start in (None, "gns-conditioned"))
+    known = np.array(inputs_of_weights("gns-conditioned", CONFIG.cable).limits)
+    assert more.mean == own.mean == inputs_of_training([store], 0.3, "gns-reference").mean
+    low, high = np.array(own.limits).T
+    np.testing.assert_array_equal(
+        more.limits, np.stack([np.minimum(low, known[:, 0]), np.maximum(high, known[:, 1])], 1)
+    )
+    assert inputs_of_training([store], 0.3, "gns-reference").limits == own.limits
 
 
 def test_stores_that_do_not_belong_together_are_refused(tmp_path):

@@ -276,6 +276,19 @@ def test_an_empty_folder_that_is_a_link_or_mounted_is_filled(tmp_path, monkeypat
     assert sorted(file.name for file in tmp_path.iterdir()) == ["data", "disk", "other"]
 
 
+def test_a_mounted_folder_that_a_kill_left_half_described_is_filled(tmp_path, monkeypatch):
+    path = tmp_path / "data"
+    complete(open_or_create(tmp_path / "other", SMALL))
+    open_or_create(path, SMALL)
+    (path / "zarr.json").unlink()  # the last to be written
+    (path / "gripper_twist" / "zarr.json").rename(path / "gripper_twist" / "zarr.json.part")
+    monkeypatch.setattr(Path, "rename", Mock(side_effect=OSError(errno.EBUSY, "Device or resource busy")))
+    store = open_or_create(path, SMALL)
+    monkeypatch.undo()
+    complete(store)
+    assert tree(path) == tree(tmp_path / "other")
+
+
 def test_altered_or_damaged_configuration_is_noticed(tmp_path):
     path = tmp_path / "data"
     open_or_create(path, SMALL)

@@ -344,6 +344,13 @@ def test_wrong_targets_are_refused():
         ShapeCableEnv(CONFIG).reset(options={"target": "X"})
 
 
+def test_a_target_needs_no_name():
+    env = ShapeCableEnv(CONFIG)
+    target = dataclasses.replace(make_target("U", CONFIG.cable), name="")
+    assert env.reset(options={"target": target})[1]["target_name"] == ""
+    env.step(np.zeros(env.action_space.shape))
+
+
 @pytest.mark.parametrize(
     "effect",
     [

@@ -220,3 +220,7 @@ def test_the_path_along_a_cloud_is_as_long_as_the_cable():
     path = cloud_path(cloud(cable, 13), S_SHAPE, 1.0)
     assert path_length(path) == pytest.approx(1.0, abs=0.04)
     np.testing.assert_allclose(path[[0, -1]], S_SHAPE[:, :2], atol=0.02)
+
+
+def test_where_everything_is_at_one_place_there_is_a_path_of_no_length():
+    assert path_length(cloud_path(np.zeros((50, 2)), np.zeros((2, 3)), 1.0)) == 0

@@ -606,6 +606,24 @@ def test_noise_at_a_high_rate_is_no_jump():
     assert samples_of(parts) == [("a/1", 900), ("a/2", 1000)] and "the whole cable jumps" in told[0]
 
 
+@pytest.mark.parametrize("interval", [1 / 100, 1 / 240])
+def test_frames_lost_at_random_are_no_jumps_of_a_cable_that_moves_fast(interval):
+    time, rng = interval * np.arange(1000), np.random.default_rng(0)
+    points = arch(np.linspace(0.0, 1.0, 9), np.full(1000, 1.0))
+    points[..., 1] += 0.2 * np.sin(2 * np.pi * time)[:, None]
+    pose = np.concatenate([points[:, [0, -1]], np.zeros((1000, 2, 1))], axis=2)
+    points[rng.random(1000) < 0.3] = np.nan
+    parts, told = cut_at_gaps((Take("a", time, points, pose),), None)
+    assert samples_of(parts) == [("a", 1000)] and told == []
+
+
+def test_rounded_keypoints_that_rest_are_kept_without_poses():
+    angles = np.concatenate([np.full(30, 0.6), np.linspace(0.6, 1.2, 170), np.full(30, 1.2)])
+    points = arch(np.linspace(0.0, 1.0, 9), angles).round(3)
+    parts, told = cut_at_gaps((take(np.append(points, 0 * points[..., :1], axis=2)),), HELD)
+    assert samples_of(parts) == [("a", 230)] and told == []
+
+
 @pytest.mark.parametrize("moves", [False, True])
 def test_rounded_keypoints_that_rest_with_the_grippers_are_kept(moves):
     angles = np.concatenate([np.linspace(0.6, 1.2, 100), np.full(30, 1.2), np.linspace(1.2, 0.6, 100)])

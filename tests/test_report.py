@@ -261,6 +261,16 @@ def test_a_shape_name_cannot_break_the_page(tmp_path):
     assert "</script><b>" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+def test_a_shape_name_is_no_formula(tmp_path):
+    runs = {("a$5_to_$9 <!--<script", "residual"): run("a$5_to_$9 <!--<script", "residual")}
+    for draw in (figures.final_shapes, figures.error_over_time):
+        draw(runs).savefig(tmp_path / "figure.svg")
+    write_gif(tmp_path / "demo.gif", runs, width=120, frames_per_second=1)
+    write_page(tmp_path / "report.html", runs, {}, about="", facts={}, gif=tmp_path / "demo.gif")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "a$5_to_$9" in page and "<!--<script" not in page
+
+
 def test_a_report_of_no_runs_is_refused():
     with pytest.raises(ValueError, match="at least one run"):
         by_shape({})

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cablejax.cable import Cable
 from cablejax.control.run import settling_time, time_in_band
 from cablejax.mpc import ObjectiveConfig
 from rows import MADE_ON, read_rows
@@ -99,7 +100,7 @@ class Trial:
     @property
     def settling_time_s(self) -> float:
         """See `control.run.settling_time` [s]; infinite if the run never settled."""
-        return settling_time(*self._course)
+        return settling_time(*self._course, Cable().length)
 
     def step_settling_time_s(self, fraction: float) -> float:
         """From when on the error stays within a fraction of the way that it went [s]; likewise.

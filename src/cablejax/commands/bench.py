@@ -11,7 +11,7 @@ from tyro.conf import subcommand
 
 from cablejax.commands.bench_simulate import BenchSimulate
 from cablejax.commands.bench_start import BenchStart
-from cablejax.commands.options import Command, UsageError, require_counts, say, text_table
+from cablejax.commands.options import Command, SeededCommand, UsageError, require_counts, say, text_table
 from cablejax.limits import require
 from cablejax.solver_names import SolverName
 
@@ -96,7 +96,7 @@ class BenchMpc(Command):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class BenchPerception(Command):
+class BenchPerception(SeededCommand):
     """Time the tracker: one frame of a moving cable, and a first frame without a prior.
 
     Attributes:

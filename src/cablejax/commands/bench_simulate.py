@@ -8,7 +8,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from cablejax.commands.cable import find_cable
-from cablejax.commands.options import Command, require_counts, say, text_table
+from cablejax.commands.options import SeededCommand, require_counts, say, text_table
 from cablejax.limits import require
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ PAPER = 2_000_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class BenchSimulate(Command):
+class BenchSimulate(SeededCommand):
     """Time the simulators, each at the time step at which it makes data: chain and MJX in a batch, C MuJoCo in threads.
 
     The engines take turns, and the median of the rounds counts. Accuracy is the distance of the keypoints from a

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from cablejax.commands.options import Command, UsageError, require_counts, say, text_table
+from cablejax.commands.options import SeededCommand, UsageError, require_counts, say, text_table
 from cablejax.compiled_programs import FOLDER, keep_compiled_programs
 from cablejax.limits import require
 
@@ -29,7 +29,7 @@ _CACHE = ("JAX_COMPILATION_CACHE", "JAX_PERSISTENT_CACHE")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class BenchStart(Command):
+class BenchStart(SeededCommand):
     """Time start-up, the first control call and a verdict, each in a separate process.
 
     Each runs first with an empty cache of compiled programs, then with the cache that the first run filled. Processor
@@ -52,6 +52,7 @@ class BenchStart(Command):
     def execute(self):
         """Runs every part with an empty and a filled folder and returns seconds of both kinds."""
         from cablejax.commands.workloads import setting
+        from cablejax.dynamics.weights import weights_path
         from cablejax.gaplog import read_gap_log
 
         require_counts(self, "repeats")
@@ -60,6 +61,8 @@ class BenchStart(Command):
             raise UsageError(f"--parts is empty, expected some of {', '.join(get_args(Part))}.")
         for log in self.logs:
             read_gap_log(log)  # what cannot be read is said before anything is timed
+        if "control" in self.parts:
+            weights_path(self.weights)
         result: dict[str, Any] = {}
         with tempfile.TemporaryDirectory() as scratch:
             folder = pathlib.Path(scratch)

@@ -7,7 +7,7 @@ import pathlib
 from typing import ClassVar, Literal
 
 from cablejax.commands.artefacts import PAGE
-from cablejax.commands.options import Command, say, text_table
+from cablejax.commands.options import SeededCommand, say, text_table
 
 PUSHED_AT = 25.0
 """When the cable is pushed [s]."""
@@ -16,7 +16,7 @@ PUSH = f"gravity_tilt:angle_rad=0.6,direction_rad=1.6,from_s={PUSHED_AT:g},until
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Demo(Command):
+class Demo(SeededCommand):
     """Shape a cable into a U, an S and a Z with the released model, and make a page about it.
 
     The cable is a fifth as stiff as the one that the model was trained on, and the table's friction follows another

@@ -24,13 +24,11 @@ class Command(abc.ABC):
 
     Attributes:
         resume_hint: Advice that Ctrl-C prints: how to resume.
-        seed: Seed of everything random; the same seed gives the same result.
         device: Where JAX computes. auto: an accelerator if there is one.
         json: Print the result as one JSON object on stdout, and nothing else there; progress goes to stderr.
     """
 
     resume_hint: ClassVar[str] = "Run the same command again."
-    seed: int = 0
     device: Literal["auto", "cpu", "gpu"] = "auto"
     json: bool = False
 
@@ -40,10 +38,25 @@ class Command(abc.ABC):
 
     def run(self) -> None:
         """Chooses the device, does the work and prints the result."""
-        require(self.seed, "seed", "--seed")
         choose_device(self.device)
         result, text = self.execute()
         print(json_format.dumps(result, indent=2, allow_nan=False) if self.json else text)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SeededCommand(Command):
+    """Options of the subcommands that draw random numbers.
+
+    Attributes:
+        seed: Seed of everything random; the same seed gives the same result.
+    """
+
+    seed: int = 0
+
+    def run(self) -> None:
+        """As every command, with a seed that can be one."""
+        require(self.seed, "seed", "--seed")
+        super().run()
 
 
 def require_counts(command: Command, *names: str) -> None:

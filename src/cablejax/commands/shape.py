@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from cablejax.commands.cable import find_cable
-from cablejax.commands.options import Command, UsageError, say, text_table
+from cablejax.commands.options import SeededCommand, UsageError, say, text_table
 from cablejax.limits import require
 from cablejax.solver_names import SolverName
 
@@ -23,7 +23,7 @@ _LEFT_OUT = 0.01
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Shape(Command):
+class Shape(SeededCommand):
     """Shape one cable into a target, on a simulated plant with the model's cable and effects of your choice.
 
     The target is a letter or a file: .npz or .json with "keypoints" [N, 2] in metres, or .csv with rows x,y. Writes

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from cablejax.commands.cable import cable_of_verdict, check_verdicts, find_cable
-from cablejax.commands.options import Command, UsageError, say
+from cablejax.commands.options import SeededCommand, UsageError, say
 from cablejax.whole_file import draft_folder, sole_writer
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Simulate(Command):
+class Simulate(SeededCommand):
     """Simulate random two-gripper motions of a cable and store them as training data.
 
     The command can be interrupted at any time, and resumes when it is run again. Several processes may share the work,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 import tyro
 
 from cablejax.commands.cable import find_cable
-from cablejax.commands.options import Command, say
+from cablejax.commands.options import SeededCommand, say
 from cablejax.limits import require
 from cablejax.text_file import read_json, write_json
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Study(Command):
+class Study(SeededCommand):
     """Record and diagnose a simulated plant in rounds, until it is clear which effect the simulator lacks.
 
     Records motions to a U, an S and a Z on the plant and diagnoses them. While several causes are left, designs the

@@ -9,18 +9,19 @@ import pathlib
 import shlex
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from cablejax.commands.options import Command, UsageError, say, text_table
+from cablejax.commands.options import SeededCommand, UsageError, say, text_table
 from cablejax.limits import require
 from cablejax.text_file import write_json
 
 if TYPE_CHECKING:
+    from cablejax.control.cable_inputs import CableInputs
     from cablejax.dataset.store import Store
     from cablejax.dynamics.error_report import ErrorReport
     from cablejax.dynamics.train_config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Train(Command):
+class Train(SeededCommand):
     """Train a model of the cable's dynamics on data sets made by `cablejax simulate`.
 
     Writes checkpoints, metrics (CSV and TensorBoard), weights.safetensors, a model card, and the error on held-out
@@ -69,23 +70,24 @@ class Train(Command):
 
     def execute(self):
         """Trains, from a checkpoint where there is one, and reports the open-loop error."""
-        from cablejax.control.cable_inputs import inputs_of_data
+        from cablejax.control.cable_inputs import inputs_of_training
         from cablejax.dataset.opening import open_store
-        from cablejax.dataset.split import read_split
+        from cablejax.dataset.split import known_motions, read_split
         from cablejax.dataset.windows import concatenate
         from cablejax.dynamics.error_report import error_report
         from cablejax.dynamics.fine_tune import starting_from
         from cablejax.dynamics.parallel import training_mesh
         from cablejax.dynamics.train import train
-        from cablejax.dynamics.weights import FILE_NAME, save_weights, weights_path
+        from cablejax.dynamics.weights import FILE_NAME, load_info, save_weights, weights_path
 
         if self.steps is not None:
             require(self.steps, "optimiser_steps", "--steps", "Leave it out for those of the preset.")
         if self.lr is not None:
             require(self.lr, "learning_rate", "--lr")
-        if self.start_from is not None and weights_path(self.start_from).resolve().is_relative_to(self.out.resolve()):
+        start = self.start_from
+        if start is not None and weights_path(start).resolve().is_relative_to(self.out.resolve()):
             raise UsageError(
-                f"--start-from {self.start_from} lies in {self.out}, where the training writes its own weights. Name "
+                f"--start-from {start} lies in {self.out}, where the training writes its own weights. Name "
                 "another folder with --out."
             )
         stores = [open_store(path) for path in self.data]
@@ -98,16 +100,19 @@ class Train(Command):
                 "a symmetric network learns the mean: leave out --symmetric to learn the difference."
             )
         training_mesh(config)  # refuses a batch that the devices cannot share, before anything is read
+        initial = None if start is None else starting_from(start, config.model)
         training, held_out = read_split(stores, self.held_out, buffer=self.buffer, seed=self.seed)
-        if self.conditioned and all(low == high for low, high in inputs_of_data(stores, self.held_out).limits):
+        inputs = inputs_of_training(stores, self.held_out, start) if self.conditioned else None
+        if inputs is not None and all(low == high for low, high in inputs.limits):
             say(
                 "All cables of the data are equally stiff and rough, so a conditioned network learns nothing of its "
                 "inputs: simulate with --stiffness-range or --friction-range, or leave --conditioned out."
             )
-        count = sum(len(part.gripper_twist) for part in held_out)
-        total = sum(store.config.n_trajectories for store in stores) - count
-        say(f"{total} trajectories to train on, {count} held out; {config.total_steps} steps")
-        initial = None if self.start_from is None else starting_from(self.start_from, config.model)
+        counts = [len(part.gripper_twist) for part in held_out]
+        total = sum(store.config.n_trajectories for store in stores) - sum(counts)
+        say(f"{total} trajectories to train on, {sum(counts)} held out; {config.total_steps} steps")
+        for sentence in known_motions(stores, counts, [] if start is None else load_info(start).get("data", [])):
+            say(f"{sentence} Simulate with another --seed.")
         result = train(
             config, training, self.out, validation=concatenate(held_out), initial=initial, overwrite=self.overwrite
         )
@@ -116,7 +121,7 @@ class Train(Command):
             raise KeyboardInterrupt(
                 f"Stopped after step {result.steps} of {config.total_steps}{kept}. Run the same command again to go on."
             )
-        info = self._info(config, stores, [len(part.gripper_twist) for part in held_out])
+        info = self._info(config, stores, counts, inputs)
         save_weights(self.out / FILE_NAME, result.model, result.weights, info)
         say("measuring the error on the held-out trajectories ...")
         names = [data["name"] for data in info["data"]]
@@ -208,19 +213,27 @@ class Train(Command):
             phases = tuple(dataclasses.replace(p, batch=self.batch) for p in phases)
         return dataclasses.replace(config, seed=self.seed, model=model, phases=phases, flips=flips)
 
-    def _info(self, config: TrainConfig, stores: list[Store], held_out: list[int]) -> dict[str, Any]:
+    def _info(
+        self, config: TrainConfig, stores: list[Store], held_out: list[int], inputs: CableInputs | None
+    ) -> dict[str, Any]:
         """Provenance of the weights, without local paths."""
         from cablejax.cable_file import cable_to_fields
-        from cablejax.control.cable_inputs import inputs_of_data
         from cablejax.dataset.schema import config_to_json
+        from cablejax.dynamics.weights import fingerprint, load_weights
         from cablejax.provenance import machine, versions
 
+        start = self.start_from
         training = json.loads(json.dumps(dataclasses.asdict(config)))
         del training["model"]  # the weights file has it, with the normalisation
         return {
             "cable": cable_to_fields(stores[0].config.cable),
             # what the model may believe of a cable
-            **({"inputs": dataclasses.asdict(inputs_of_data(stores, self.held_out))} if self.conditioned else {}),
+            **({} if inputs is None else {"inputs": dataclasses.asdict(inputs)}),
+            **(
+                {}
+                if start is None
+                else {"start_from": pathlib.Path(start).name, "start_weights": fingerprint(load_weights(start)[2])}
+            ),
             "effects": list(dict.fromkeys(effect for store in stores for effect in store.config.effects_shown)),
             "data": [
                 {

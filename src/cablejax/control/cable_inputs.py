@@ -18,7 +18,7 @@ from cablejax.dataset.schema import config_from_json
 from cablejax.dataset.split import split
 from cablejax.dataset.store import Store
 from cablejax.dataset.windows import known_of_cables
-from cablejax.dynamics.weights import WeightsError, load_info
+from cablejax.dynamics.weights import WeightsError, load_info, load_weights
 from cablejax.effects.given import GivenEffect, with_effects
 from cablejax.effects.physics import mean_resistance, nominal_physics
 from cablejax.types import cable_descriptor
@@ -77,8 +77,13 @@ def inputs_of(effects: Sequence[GivenEffect], cable: Cable) -> np.ndarray:
     return np.asarray(cable_descriptor(*map(np.asarray, mean_resistance(physics))))
 
 
-def inputs_of_data(stores: Sequence[Store], held_out: float) -> CableInputs:
-    """Of the trajectories of data sets that `dataset.split` leaves to train on."""
+def inputs_of_training(
+    stores: Sequence[Store], held_out: float, start_from: str | os.PathLike[str] | None = None
+) -> CableInputs:
+    """Of the trajectories of data sets that `dataset.split` leaves to train on.
+
+    A conditioned model to start from has learned more cables: the limits include its own.
+    """
     parts = []
     for store in stores:
         rows, _ = split(store.config.n_trajectories, held_out)
@@ -87,6 +92,9 @@ def inputs_of_data(stores: Sequence[Store], held_out: float) -> CableInputs:
     low, high = known.min(axis=0), known.max(axis=0)
     # the mean of equal numbers is rounded
     stiffness, friction = np.clip(known.mean(axis=0), low, high).tolist()
+    if start_from is not None and load_weights(start_from)[0].conditioned:
+        before = np.array(inputs_of_weights(start_from, stores[0].config.cable).limits)
+        low, high = np.minimum(low, before[:, 0]), np.maximum(high, before[:, 1])
     return CableInputs((stiffness, friction), tuple(zip(low.tolist(), high.tolist(), strict=True)))
 
 

@@ -15,8 +15,8 @@ from cablejax.mpc.state import Action
 SETTLING_FRACTION = 0.1
 """Half-width of the band around the terminal error in which a run counts as settled, relative to that error or, where
 that is less, to the change of the error over the run."""
-SETTLING_FLOOR_CM = 0.1
-"""Smallest half-width of that band [cm]."""
+SETTLING_FLOOR = 1e-3
+"""Smallest half-width of that band, in lengths of the cable."""
 _SEEN = 0.5
 """Share of the keypoints below which a view says too little of where the cable is."""
 SETTLING_DWELL = 3
@@ -73,7 +73,7 @@ class ClosedLoopRun:
     @property
     def settling_time_s(self) -> float:
         """See `settling_time`."""
-        return settling_time(self.times, self.error_cm)
+        return settling_time(self.times, self.error_cm, self.target.length)
 
     @property
     def straightened(self) -> Bool[np.ndarray, " T"]:
@@ -128,14 +128,14 @@ def shape_error_cm(keypoints: Float[Any, "*T N 2"], target: Float[Any, "*#T N 2"
     return xp.where(count > 0, 100 * xp.sqrt(total / xp.maximum(count, 1)), xp.nan)
 
 
-def settling_time(times: Float[np.ndarray, " T"], error_cm: Float[np.ndarray, " T"]) -> float:
+def settling_time(times: Float[np.ndarray, " T"], error_cm: Float[np.ndarray, " T"], length: float) -> float:
     """First time from which on the error stays near its last value; infinite if it was still changing at the end.
 
     Near means within 10 % of the last value, and within 10 % of the error's change over the run where the target stayed
-    far; 1 mm is near in any case. The last three samples must all be near.
+    far; a thousandth of the cable's `length` [m] is near in any case. The last three samples must all be near.
     """
     error = np.asarray(error_cm)
-    band = max(SETTLING_FRACTION * min(error[-1], abs(error[0] - error[-1])), SETTLING_FLOOR_CM)
+    band = max(SETTLING_FRACTION * min(error[-1], abs(error[0] - error[-1])), 100 * SETTLING_FLOOR * length)
     return time_in_band(times, error, band)
 
 

@@ -47,6 +47,16 @@ def draw(config: DatasetConfig, index: int, attempt: int = 0) -> Draw:
     )
 
 
+def moves_alike(config: DatasetConfig, other: DatasetConfig) -> bool:
+    """Whether trajectories of one number have one motion of the grippers in both, whatever their cables."""
+
+    def of(one: DatasetConfig):
+        drawn = sum(limits is not None for limits in dataclasses.astuple(one.randomisation))
+        return one.seed, drawn, one.cable.length, one.n_steps, one.motion, one.interval
+
+    return of(config) == of(other)
+
+
 def draw_all(config: DatasetConfig, indices: Sequence[int], attempt: int = 0) -> list[Draw]:
     """`draw` of some trajectories, on all cores."""
     with concurrent.futures.ThreadPoolExecutor(available_cores()) as pool:

@@ -28,7 +28,7 @@ from cablejax.dataset.store import Store
 from cablejax.limits import shown
 from cablejax.provenance import package_versions
 from cablejax.text_file import differences, read_json, version_of
-from cablejax.whole_file import draft_folder, whole_file
+from cablejax.whole_file import DRAFT, draft_folder, whole_file
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 """Packages whose versions decide the content, besides cablejax itself: those that begin a store must complete it."""
@@ -133,11 +133,7 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
         _create_in_bucket(place, config, versions)
     elif place.exists() and not place.is_dir():
         raise ValueError(f"{place} is a file, expected a folder to write a data set to. Give another place.")
-    elif place.is_dir() and any(place.iterdir()) and not (place / "zarr.json").is_file():
-        raise ValueError(
-            f"{place} exists and holds files other than a data set. Give an empty or new folder; nothing was changed."
-        )
-    elif not place.is_dir() or not any(place.iterdir()):
+    elif not (place / "zarr.json").is_file():
         _create(place, config, versions)
     store = recorded_store(place, "r+")
     changes = _changes(store.recorded, config_to_json(config))
@@ -172,9 +168,20 @@ def _changes(stored: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
 def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None:
     """Makes the empty store under a temporary name and renames it: it appears whole, and only once.
 
-    Into an empty folder that cannot be renamed, as a mounted one, its own description is written last.
+    Into a folder that cannot be replaced, as a mounted one, its own description is written last; a process that was
+    killed before may have left the others there.
+
+    Raises:
+        ValueError: the folder holds anything else.
     """
     path = path.resolve()
+    files = (file for file in path.rglob("*") if file.is_file() and not file.name.endswith(DRAFT))
+    if any(file.name != "zarr.json" or file.parent == path for file in files):
+        if (path / "zarr.json").is_file():  # another process was first
+            return
+        raise ValueError(
+            f"{path} exists and holds files other than a data set. Give an empty or new folder; nothing was changed."
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     with draft_folder(path) as draft:
         _fill(draft, config, versions)
@@ -183,7 +190,7 @@ def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None
         except OSError:
             if (path / "zarr.json").is_file():  # another process was first
                 return
-            if not path.is_dir() or any(path.iterdir()):
+            if not path.is_dir():
                 raise
             for name, content in _descriptions(config, versions).items():
                 _write(path, name, content)

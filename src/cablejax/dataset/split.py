@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from cablejax.dataset.drawing import moves_alike
 from cablejax.dataset.opening import open_store
+from cablejax.dataset.schema import DatasetConfig, config_from_json
 from cablejax.dataset.store import Store
 from cablejax.dataset.streaming import StreamedData, blocks_of
 from cablejax.dataset.windows import concatenate, read_trajectories
@@ -98,3 +102,36 @@ def _check_apart(
                     f"{both.sum()} of the {len(last)} trajectories held out of {store.path} are training trajectories "
                     f"of {other.path}: simulate one of the two with another --seed."
                 )
+
+
+def known_motions(
+    stores: Sequence[Store], held_out: Sequence[int], before: Sequence[Mapping[str, Any]] = ()
+) -> list[str]:
+    """Sentences on trajectories that are held out though their motion is trained on, with this cable or another.
+
+    Args:
+        stores: that are trained on.
+        held_out: how many trajectories of each are held out.
+        before: data sets of the model to start from, as its weights record them.
+    """
+    trained = [
+        (str(store.path), store.config, store.config.n_trajectories - count)
+        for store, count in zip(stores, held_out, strict=True)
+    ]
+    own = list(trained)
+    for data in before:
+        with contextlib.suppress(ValueError):  # an earlier version's
+            config = config_from_json(DatasetConfig, data["config"])
+            trained.append(
+                (f"{data['name']}, of the model to start from", config, config.n_trajectories - data["held_out"])
+            )
+    found = []
+    for name, config, first in own:
+        for other, there, end in trained:
+            known = min(config.n_trajectories, end) - first
+            if known > 0 and moves_alike(config, there):
+                found.append(
+                    f"{known} of the {config.n_trajectories - first} trajectories held out of {name} have motions that "
+                    f"are trained on in {other}: the error that will be measured is too small."
+                )
+    return found

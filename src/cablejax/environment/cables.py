@@ -32,7 +32,7 @@ class Cables:
         taken: actions in this episode, shape [B].
         executed: the last action after its limits, in the same units, see `step`; 0 where it was not executed and after
             a reset, float32, shape [B, 2, 3].
-        names: of the targets.
+        names: of the targets; None before the first reset.
     """
 
     def __init__(self, config: ShapeCableConfig, size: int):
@@ -57,7 +57,7 @@ class Cables:
         self.gripper_pose = rows(np.asarray(pose, np.float32)[None])
         self.error, self.taken = np.zeros(size), np.zeros(size, int)
         self.executed = np.zeros((size, 2, 3), np.float32)
-        self.names = [""] * size
+        self.names: list[str | None] = [None] * size
 
     def _at_rest(self, physics: Physics) -> tuple[CableState, Float[np.ndarray, "2 N 2"]]:
         """One cable before its first action: its state, its true and its seen keypoints [m]; NaN where it diverges."""

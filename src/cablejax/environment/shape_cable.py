@@ -54,7 +54,7 @@ def _known(options: dict[str, Any] | None) -> dict[str, Any]:
 
 
 def _require_reset(cables: Cables) -> None:
-    if not all(cables.names):
+    if None in cables.names:
         raise gymnasium.error.ResetNeeded("There is no cable yet: call `reset` before `step`.")
 
 

@@ -117,9 +117,10 @@ def cloud_path(
     start = np.concatenate([row, np.tile(np.arange(len(nodes)), 2)])
     end = np.concatenate([neighbour.ravel(), np.repeat([0, 1], len(nodes))])
     cost = (np.concatenate([distance.ravel(), direct.T.ravel()]) / cell) ** power
-    keep = cost > 0
-    pairs, index = np.unique(np.stack([start[keep], end[keep]]), axis=1, return_index=True)
-    graph = coo_matrix((cost[keep][index], pairs), shape=(len(nodes), len(nodes))).tocsr()
+    pairs, index = np.unique(np.stack([start, end]), axis=1, return_index=True)
+    # of no length, but an edge: nodes may be at one place
+    cost = np.maximum(cost[index], np.finfo(float).tiny)
+    graph = coo_matrix((cost, pairs), shape=(len(nodes), len(nodes))).tocsr()
     _, previous = dijkstra(graph, directed=False, indices=0, return_predecessors=True)
     path = [1]
     while path[-1] != 0:

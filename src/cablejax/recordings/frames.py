@@ -29,8 +29,9 @@ AXES: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
 ALONG = np.radians(45)
 """Largest angle between a gripper's x axis and the markers on it."""
 
-FLAT = 0.02
-"""Height above or below the others that 99 % of the keypoints of a cable on a table keep within [m]."""
+FLAT, SLOPE = 0.02, 0.03
+"""Height above or below the others that 99 % of the keypoints of a cable on a table keep within [m], and as a share of
+how far they extend horizontally: a frame is seldom levelled better."""
 
 RIGID = np.radians(8)
 """Largest root-mean-square angle by which a pair of markers may turn against the gripper that it is on."""
@@ -108,12 +109,13 @@ def onto_table(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
     points = np.concatenate([take.keypoints.reshape(-1, 3) for take in takes])
     off = np.abs(points - np.nanmedian(points, axis=0))
     extent = np.nanquantile(off, 0.99, axis=0)
-    if not extent[2] <= FLAT:
+    highest = max(FLAT, SLOPE * float(extent[:2].max()))
+    if not extent[2] <= highest:
         raise ValueError(
             f"The layout has a [table], and keypoints lie {1e3 * extent[2]:.3g} mm above or below the others, expected "
-            f"at most {1e3 * FLAT:g} mm (99 % of them; along the two horizontal axes they extend {1e3 * extent[0]:.3g} "
-            f"and {1e3 * extent[1]:.3g} mm). Check which axis points up, and that it is the table's normal. For a "
-            "cable that hangs, leave [table] out of the layout."
+            f"at most {1e3 * highest:.3g} mm (99 % of them; along the two horizontal axes they extend "
+            f"{1e3 * extent[0]:.3g} and {1e3 * extent[1]:.3g} mm). Check which axis points up, and that it is the "
+            "table's normal. For a cable that hangs, leave [table] out of the layout."
         )
 
     def flat(take: Take) -> Take:
@@ -177,7 +179,12 @@ def require_rigid(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...]) -
             f"The markers {first} and {second} on gripper {gripper} turn against its orientation by "
             f"{np.degrees(spread):.0f} degrees (root mean square), expected at most {np.degrees(RIGID):.0f}: positions "
             "and orientations are not of one frame. "
-            + (f"They fit if {' or if '.join(fitting)}." if fitting else "Check which gripper and markers these are.")
+            + (
+                f"They fit if {' or if '.join(fitting)}."
+                if fitting
+                else "Check which gripper and markers these are. Where only the end keypoint is on the gripper, state "
+                'keypoints_on_grippers = "ends".'
+            )
         )
 
 

@@ -163,7 +163,8 @@ def _known(take: Take, on_grippers: tuple[int, ...] | None) -> Bool[np.ndarray, 
 def _without_repeats(take: Take, reports: list[str]) -> Take:
     """The take without the samples in which a tracker holds its last values.
 
-    Rounded keypoints of a cable that rests repeat too: samples in which both grippers rest are kept.
+    Rounded keypoints of a cable that rests repeat too: samples in which both grippers rest are kept, and without poses
+    those after which the cable has not moved on.
     """
     one, other, hidden = take.keypoints[1:], take.keypoints[:-1], np.isnan(take.keypoints)
     same = ((one == other) | (hidden[1:] & hidden[:-1])).all(axis=(1, 2)) & ~hidden[1:].all(axis=(1, 2))
@@ -195,9 +196,9 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
 
 
 def _moves(take: Take, first: int, last: int, distance: float) -> bool:
-    """Whether a gripper moves by more than a distance [m] between two samples, or no poses were measured."""
+    """Whether a gripper moves by more than a distance [m] between two samples; without poses, the cable after them."""
     if take.gripper_pose is None:
-        return True
+        return float(median_step(take.keypoints[last : last + 2]).max(initial=0.0)) > distance
     return gripper_motion(take.gripper_pose[first : last + 1], take.keypoints.shape[2]) > distance
 
 
@@ -271,8 +272,9 @@ def _breaks(take: Take) -> tuple[list[int], list[str]]:
 
 
 def _jumps(step: Float[np.ndarray, " S"], interval: Float[np.ndarray, " S"], least: float) -> list[int]:
-    speed = np.nan_to_num(step / interval)
-    neighbour = np.maximum(np.append(speed[1:], 0.0), np.append(0.0, speed[:-1]))
+    # a step between samples that were not seen is unknown: next to two of them nothing tells a jump from motion
+    speed = step / interval
+    neighbour = np.fmax(np.append(speed[1:], np.nan), np.append(np.nan, speed[:-1]))
     acceleration = (speed - neighbour) / interval
     found = (acceleration > JUMP_ACCELERATION) & (speed > JUMP_RATIO * neighbour) & (step > least)
     return np.flatnonzero(found).tolist()

@@ -174,7 +174,8 @@ def _poses(table: _Table, fields: Fields, dimension: int) -> np.ndarray | None:
     width = 3 if dimension == 2 else 7
     what = "x, y and the angle" if dimension == 2 else "x, y, z, qw, qx, qy and qz"
     names = [fields.names(f"gripper_{q}", (width,), f"the {width} columns of {what}", None) for q in (0, 1)]
-    unit = fields.take("angle_unit", str, "rad or deg", "rad")
+    # a quaternion has no unit: left where it is, the field is refused
+    unit = fields.take("angle_unit", str, "rad or deg", "rad") if dimension == 2 else "rad"
     if unit not in _ANGLES:
         raise ValueError(f"{fields.path}: [columns] angle_unit is {unit!r}, expected rad or deg.")
     if names[0] is None and names[1] is None:

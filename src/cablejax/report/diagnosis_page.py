@@ -45,18 +45,15 @@ _BADGES: dict[Verdict, tuple[str, str]] = {
     "named+unknown": ("partly", "Part of the cause named"),
     "unknown": ("unknown", "Cause unknown"),
 }
-INFORMING = frozenset(
-    (
-        "stiffness_profile",
-        "intrinsic_curvature",
-        "gripper_rotation_offset",
-        "gripper_compliance",
-        "bending_stiffness",
-        "table_friction",
-        "linear_density",
-    )
-)
-"""Effects that a model can be informed of, see `control.shaping.knowing`; the last three are for conditioned models."""
+INFORMING = {
+    **dict.fromkeys(
+        ("stiffness_profile", "intrinsic_curvature", "gripper_rotation_offset", "gripper_compliance"), "a model"
+    ),
+    **dict.fromkeys(
+        ("bending_stiffness", "table_friction", "linear_density"), "a conditioned model, such as gns-conditioned,"
+    ),
+}
+"""Effects of which a model can be informed, see `control.shaping.knowing`, and which models can be."""
 _DPI = 150
 _SPACE_CAPTION = (
     "Up to five seconds of motion, simulated from two observed samples, in the files with the largest, median and "
@@ -133,7 +130,8 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         pictures=inline,
         orbit=orbit,
         trainable=addable and simulated.isdisjoint(OUTSIDE) and cable_of_log(diagnosis.log).marks is None,
-        informs=addable and not named.isdisjoint(INFORMING),
+        # the words for every model are the shorter ones
+        informs=min((INFORMING[name] for name in named & INFORMING.keys()), key=len, default="") if addable else "",
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
         where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,
         effects=sections.named_effects(diagnosis),

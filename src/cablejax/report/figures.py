@@ -61,7 +61,7 @@ def final_shapes(runs: Runs) -> Figure:
             ax.plot(*cable_curve(target).T, color=LIGHT.target, lw=7, alpha=0.45, solid_capstyle="round")
             for method, run in pair.items():
                 _draw_cable(ax, run, -1, method, size_of(runs))
-            ax.set_title(shape, fontsize=14)
+            ax.set_title(shape, fontsize=14, parse_math=False)
             for row, (method, run) in enumerate(reversed(pair.items())):
                 words = f"{run.terminal_error_cm:.2f} cm {METHOD_LABEL[method]}"
                 ax.annotate(
@@ -191,7 +191,7 @@ def _row_of_panels(shapes: list[str], label: str) -> tuple[Figure, np.ndarray]:
     for ax, shape in zip(axes, shapes, strict=True):
         ax.grid(axis="y")
         ax.set_xlabel("time [s]")
-        ax.set_title(shape, fontsize=13)
+        ax.set_title(shape, fontsize=13, parse_math=False)
     axes[0].set_ylabel(label)
     return figure, axes
 

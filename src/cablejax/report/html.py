@@ -41,8 +41,8 @@ def _environment() -> jinja2.Environment:
 
 
 def json_script(value: Any) -> Markup:
-    """JSON for a script element. A closing tag within a string would end the element, so its slash is escaped."""
-    return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("</", "<\\/"))
+    """JSON for a script element, without a tag or a comment that a string could open or close there."""
+    return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
 
 
 def svg(figure: Figure, name: str) -> Markup:

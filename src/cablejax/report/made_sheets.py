@@ -103,7 +103,7 @@ def weights_sheet(source: str | os.PathLike[str], name: str) -> Sheet:
         lead=f"{name}: {network_words(config).removesuffix(',')}, one step of {config.interval:g} s, {config.history} "
         "samples of history.",
         cards=[
-            ("Trained on", listed([f"{row[1]} motions" for row in data]) or "not stated", "by data set"),
+            ("Data", listed([f"{row[1]} motions" for row in data]) or "not stated", "by set, held out ones included"),
             ("Corrects", "no prior" if config.prior == "none" else f"the {config.prior} prior", ""),
             ("Uses the cable's stiffness", "yes" if config.conditioned else "no", "as an input"),
             ("Mirrored cables move alike", "yes" if config.symmetric else "not exactly", ""),

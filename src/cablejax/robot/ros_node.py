@@ -16,8 +16,9 @@ RATE_HZ = 20.0
 """Rate at which the watchdog looks and the command is published."""
 
 _UNKNOWN, _STILL = np.full((2, 3), np.nan), np.zeros((2, 3))
-_KEPT = 100
-"""Messages of the grippers that are looked through, some ticks even at the rate of an arm's controller."""
+_KEPT = 500
+"""Messages of the grippers that wait and are looked through: half a second at the rate of an arm's controller, longer
+than a command takes to compute."""
 
 
 def spin(run: RobotRun, *, name: str = "cablejax", frame: str = "world") -> pathlib.Path:
@@ -84,7 +85,7 @@ def _make_node(run: RobotRun, name: str, frame: str) -> Any:
             self._twists = [self.create_publisher(TwistStamped, f"~/gripper_{q}/twist", 1) for q in (0, 1)]
             self._status = self.create_publisher(String, "~/status", 1)
             self.create_subscription(PoseArray, "~/keypoints", self.on_keypoints, 10)
-            self.create_subscription(PoseArray, "~/grippers", self.on_grippers, 10)
+            self.create_subscription(PoseArray, "~/grippers", self.on_grippers, _KEPT)
             self.create_timer(1.0 / RATE_HZ, self.on_timer)
 
         def on_grippers(self, message: Any) -> None:
