@@ -227,10 +227,21 @@ def test_a_lag_of_the_arms_is_not_smoothed_away():
     assert (error < 0.8 * SCATTER).all()
 
 
-def test_measured_poses_that_scatter_are_no_gap():
+@pytest.mark.parametrize("times", [1.0, pytest.param(3.0, marks=pytest.mark.slow)])
+def test_measured_poses_that_scatter_are_no_gap(times):
     log = record()
-    result = told(dataclasses.replace(log, gripper_pose=scattered(log.gripper_pose).astype(np.float32)))
+    pose = log.gripper_pose + times * (scattered(log.gripper_pose) - log.gripper_pose)
+    result = told(dataclasses.replace(log, gripper_pose=pose.astype(np.float32)))
     assert result.verdict == "none" and caveat(result, "gripper poses scatter")
+
+
+def test_motion_in_few_samples_is_no_scatter():
+    time = np.arange(120.0)[None, :, None, None]  # a sample per second
+    pose = 0.2 * np.sin(2 * np.pi * time / np.array([[20.0], [15.0]]) + np.arange(3.0)).repeat(4, axis=0)
+    smooth, taken = steadied(pose, np.zeros_like(pose), np.full(4, 120))
+    assert smooth is pose and not taken.any()
+    noisy = pose + 0.01 * np.random.default_rng(0).standard_normal(pose.shape)
+    assert (steadied(noisy, np.zeros_like(pose), np.full(4, 120))[1] > 3e-3).all()
 
 
 def test_commands_made_of_poses_are_none():

@@ -39,9 +39,11 @@ def test_keypoints_show_the_length(ratio):
     np.testing.assert_allclose(back.meta["keypoint_arclength_m"], np.linspace(0, length.measured, 13))
 
 
-def test_a_right_length_is_not_doubted():
+@pytest.mark.parametrize("noise", [0.0, 1e-2])
+def test_a_right_length_is_not_doubted(noise):
     log = record()
-    assert other_length(Case.of(log)) is None
+    off = noise * np.random.default_rng(0).standard_normal(log.keypoints.shape).astype(np.float32)
+    assert other_length(Case.of(dataclasses.replace(log, keypoints=log.keypoints + off))) is None
 
 
 def test_a_crumpled_nominal_cable_says_nothing_of_the_length():

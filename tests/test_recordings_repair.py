@@ -618,7 +618,7 @@ def test_frames_lost_at_random_are_no_jumps_of_a_cable_that_moves_fast(interval)
 
 
 def test_rounded_keypoints_that_rest_are_kept_without_poses():
-    angles = np.concatenate([np.full(30, 0.6), np.linspace(0.6, 1.2, 170), np.full(30, 1.2)])
+    angles = np.concatenate([np.full(15, 0.6), np.linspace(0.6, 1.2, 200), np.full(15, 1.2)])
     points = arch(np.linspace(0.0, 1.0, 9), angles).round(3)
     parts, told = cut_at_gaps((take(np.append(points, 0 * points[..., :1], axis=2)),), HELD)
     assert samples_of(parts) == [("a", 230)] and told == []

@@ -198,6 +198,11 @@ def _check_cable(meta: dict[str, Any], points: int) -> None:
             raise ValueError(f"Field 'meta.{name}' is {shown(value)}, expected an object.")
     if strangers := [key for key in table if key in NUMBERS and key != _FRICTION]:
         raise ValueError(f"Field 'meta.table' has {', '.join(strangers)}, which belongs into 'meta.cable'.")
+    if meta["table"] is None and cable.get(_FRICTION):
+        raise ValueError(
+            f"Field 'meta.cable' has {_FRICTION}, and 'meta.table' is null, as of a cable that hangs: the friction of "
+            "a table belongs into 'meta.table'."
+        )
     known = {key: value for key, value in cable.items() if key in NUMBERS and key != _FRICTION}
     lacking = {key: LIMITS[name].unit for key, (name, _) in NUMBERS.items() if key not in {**known, _FRICTION: None}}
     for key in cable:

@@ -15,7 +15,7 @@ import scipy.optimize
 from jaxtyping import Bool, Float, Int
 
 from cablejax.diagnose.diagnosis import ParameterEstimate
-from cablejax.diagnose.log_faults import integrated, scatter_of
+from cablejax.diagnose.log_faults import integrated, scatter_of, steadied
 from cablejax.diagnose.posterior import QUANTILE
 from cablejax.diagnose.refits import FOLDS, dealt
 from cablejax.effects.arms import lagged
@@ -25,6 +25,8 @@ from cablejax.types import ROTATION_WEIGHT
 _ENCODER_NOISE = 5e-5
 NEGLIGIBLE = 2e-4
 """A deviation of less than this is none [m]."""
+# Nor is one of less than this share of the poses' noise, which is not known better.
+_UNSURE = 0.25
 # An effect explains the arms' deviation if it leaves no more than this share of it, root mean square.
 _EXPLAINED = 0.25
 # An effect that leaves more of it than this is not named: a backlash looks like a lag, and leaves more.
@@ -98,7 +100,7 @@ class _Arms:
 
     def predicted(self, effects: tuple[str, ...], theta) -> Float[np.ndarray, "E T 2 3"]:
         """Poses with the effects: of a gain its value, of a lag the pure delay and the time constant [s]."""
-        theta, start = list(theta), self.pose[:, :1]
+        theta, start = list(theta), self.commanded[:, :1]
         gain = theta.pop(0) if "actuation_gain" in effects else 1.0
         delay, slow = theta if "actuation_lag" in effects else (0.0, 0.0)
         moved = start + gain * (self.commanded - start)
@@ -189,13 +191,22 @@ def actuation(
         return Actuation(np.zeros(len(pose), int), motion, pose, pose)
     valid = (np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]) & known[:, None]
     whole = known[:, None, None, None]
-    commanded = np.where(whole, integrated(pose[:, 0], command, interval), pose)
-    arms = _Arms(pose, commanded, np.asarray(interval), valid)
-    deviation = arms.rms(arms.commanded)
-    count, noise = 6 * valid.sum(axis=1), max(arms.noise, _ENCODER_NOISE)
-    nothing = Actuation(count, motion, arms.commanded, arms.commanded, deviation, deviation, noise)
-    if deviation < NEGLIGIBLE:
-        return nothing
+    expected = np.where(whole, integrated(pose[:, 0], command, interval), pose)
+
+    def begun_at(start: Float[np.ndarray, "E 2 3"]) -> tuple[_Arms, Actuation]:
+        """The arms from better first poses: a reading's noise would be in all that is integrated from it."""
+        commanded = np.where(whole, expected + (start - pose[:, 0])[:, None], pose)
+        arms = _Arms(pose, commanded, np.asarray(interval), valid)
+        off, noise = arms.rms(commanded), max(arms.noise, _ENCODER_NOISE)
+        return arms, Actuation(6 * valid.sum(axis=1), motion, commanded, commanded, off, off, noise)
+
+    counted = np.maximum(valid.sum(axis=1), 1)[:, None, None]
+    off = np.where(valid[:, :, None, None], pose - expected, 0.0).sum(axis=1) / counted
+    _, exact = begun_at(pose[:, 0] + off)
+    if exact.deviation < max(NEGLIGIBLE, _UNSURE * exact.noise):
+        return exact
+    arms, nothing = begun_at(steadied(pose, expected, length)[0][:, 0])
+    deviation = nothing.deviation
 
     lags = [[0.1, 0.05], [0.02, 0.2], [0.4, 0.2]]
     found: dict[tuple[str, ...], Any] = {

@@ -38,10 +38,11 @@ def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration,
         )
         for name, parameters in arms.effects.items()
     )
-    among_singles = softmax([scores[name,] for name in arms.alone])
+    # or none of them
+    chances = softmax([scores[()], *(scores[name,] for name in arms.alone)])[1:]
     ranked = [
         Ranked(name, float(chance), float(np.clip(1 - (unseen / arms.deviation) ** 2, -1.0, 1.0)), 1e3 * left)
-        for chance, (name, (left, unseen)) in zip(among_singles, arms.alone.items(), strict=True)
+        for chance, (name, (left, unseen)) in zip(chances, arms.alone.items(), strict=True)
     ]
     changed: dict[Verdict, Verdict] = {}
     if named and arms.explained(negligible(calibration, length)):

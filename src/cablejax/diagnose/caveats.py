@@ -70,6 +70,13 @@ def caveats_of(
         commissioned: whether logs without an effect were given.
     """
     caveats = list(case.recording.caveats)
+    seen = np.isfinite(case.recording.keypoints).any(axis=(1, 2, 3))
+    if len(np.unique(case.motion[seen])) < 2:
+        one = "episode" if len(case.motion) == 1 else "motion in which keypoints were observed"
+        caveats.append(
+            f"The log has one {one}, so none can be held out: no shrinkage is reported, and every probability is less "
+            "certain than it looks."
+        )
     if not commissioned:
         caveats.append(
             "No commissioning logs were given: the simulator's own error cannot be separated from the gap and is "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -194,9 +195,7 @@ def _ranking(found: Search) -> tuple[Ranked, ...]:
     tried = {r.name for r in result}
     # effects whose best template explained too little to be fitted
     result += [
-        Ranked(name, 0.0, float(np.clip(share, 0.0, 1.0)), 1e3 * excess(null, evidence))
-        for name, share in found.screened.items()
-        if name not in tried
+        Ranked(name, 0.0, math.nan, 1e3 * excess(null, evidence)) for name in found.screened if name not in tried
     ]
     return tuple(sorted(result, key=lambda r: -(r.probability or 0.0)))
 

@@ -96,10 +96,11 @@ class Ranked:
 
     Attributes:
         name: of the effect.
-        probability: posterior among all single effects, were the cause one of them; None where it was not computed, as
-            in a forward search.
-        held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit; negative where the
-            effect makes these worse.
+        probability: posterior among all single effects of the cable, were the cause one of them; of an effect of the
+            arms, which is another question, among these and none. None where it was not computed, as in a forward
+            search.
+        held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit, from -1: negative
+            where the effect makes these worse. NaN of an effect whose templates explained too little for a fit.
         leftover_mm: gap above the noise that is left, root mean square per coordinate [mm, or thousandths of
             `Gap.unit`], on the episodes fitted; of a forward search, on those left out.
         outcome: of a forward search: "kept", "did not help", or "not judged" where the simulation was lost with it.

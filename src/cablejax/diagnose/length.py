@@ -93,6 +93,9 @@ def _closeness(case: Case) -> np.ndarray:
     seen, nominal = (
         np.linalg.norm(np.diff(points, axis=2), axis=-1) for points in (case.recording.keypoints, case.nominal)
     )
+    # noise across the cable lengthens every distance
+    noise = case.noise.std**2
+    seen = np.sqrt(np.maximum(seen**2 - (noise[1:] + noise[:-1]), 0.0))
     marks = case.simulator.playback.arclength
     stretched = nominal > _STRETCHED * np.diff(marks)
     ratio = np.where(stretched, seen / np.where(stretched, nominal, 1.0), np.nan)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,6 +22,8 @@ _STEADY = np.array([1e-4, 1e-4, 1e-3])
 # Samples over which they may be smoothed by a parabola.
 _WINDOWS = (5, 7, 11, 15, 21, 31, 45, 65, 91)
 _PARABOLA = 2
+# Scatter by fifth differences over that by third ones, at least.
+_WHITE = 0.5
 # Commands that leave the poses by this [m], and by this part of it in another meaning, have that one.
 _UNFIT, _FITS = 0.02, 0.2
 # By how much poses may come later than the keypoints for it to be looked for [s].
@@ -163,16 +166,20 @@ def integrated(
     return first[:, None] + np.concatenate([np.zeros_like(steps[:, :1]), np.cumsum(steps, axis=1)[:, :-1]], axis=1)
 
 
-def scatter_of(off: Float[np.ndarray, "E T 2 3"], valid: Bool[np.ndarray, "E T"]) -> Float[np.ndarray, "2 3"]:
-    """Noise of poses, from third differences of their deviations, which are smooth except for jumps.
+def scatter_of(
+    off: Float[np.ndarray, "E T 2 3"], valid: Bool[np.ndarray, "E T"], order: int = 3
+) -> Float[np.ndarray, "2 3"]:
+    """Noise of poses, from differences of their deviations, which are smooth except for jumps.
 
     Args:
         off: in any unit of each coordinate.
         valid: samples that are no padding.
+        order: of the differences.
     """
-    third = np.diff(off, 3, axis=1)[valid[:, 3:]]
-    # of white noise a third difference is sqrt(20) times as large
-    return np.median(np.abs(third), axis=0) / (0.6745 * np.sqrt(20.0)) if third.size else np.zeros(off.shape[2:])
+    differences = np.diff(off, order, axis=1)[valid[:, order:]]
+    # of white noise they are so many times as large
+    larger = math.sqrt(math.comb(2 * order, order))
+    return np.median(np.abs(differences), axis=0) / (0.6745 * larger) if differences.size else np.zeros(off.shape[2:])
 
 
 def steadied(
@@ -198,7 +205,9 @@ def steadied(
     """
     off, steady = pose - expected, np.zeros((2, 3))
     valid = np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]
-    noisy = scatter_of(off, valid) > least
+    scatter = scatter_of(off, valid)
+    # of noise both orders say the same; of motion in few samples, higher differences are smaller
+    noisy = (scatter > least) & (scatter_of(off, valid, 5) > _WHITE * scatter)
     if not noisy.any():
         return pose, steady
     smooth = pose.copy()

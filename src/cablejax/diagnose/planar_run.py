@@ -131,7 +131,7 @@ def _constants(case: Case, given: Calibration | None, commissioning: Sequence[Ga
         names = ["the log", *(f"commissioning log {i + 1}" for i in range(len(commissioning)))]
         joined([case.log, *commissioning], names)
         calibration = dataclasses.replace(calibration, baseline=baseline_error(commissioning))
-    if given is None:
+    elif given is None:
         stated = case.stated_error()
         assumed = float(np.linalg.norm([calibration.baseline, stated, case.pose_error()]))
         calibration = dataclasses.replace(calibration, baseline=assumed)

@@ -100,11 +100,8 @@ def prepare(log: GapLog) -> Recording:
         )
     n_episodes = len(log.episode_length)
     log, caveats = as_measured(log)
-    if n_episodes == 1:
-        caveats.append(
-            "The log has one episode, so none can be held out: no shrinkage is reported, and every probability is less "
-            "certain than it looks."
-        )
+    if log.meta["table"] is None:
+        caveats.append("The log states no table: the cable is taken to lie on one without friction.")
     short = [e for e in range(n_episodes) if log.episode_length[e] < _SHORTEST]
     if len(short) == n_episodes:
         raise DiagnosisError(

@@ -39,8 +39,8 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one. All
     `_mm` are null where observations are not in metres; `gap` has the sizes in their own unit too.
 
-    In addition to the fields of the format it has `cable` (the keys of a cable file: as the log states it), `dimension`
-    (2 on a table, 3 in space, null for a simulator of one's own and a hanging wire), `place_m` (where the grippers are
+    In addition to the fields of the format it has `cable` (the keys of a cable file: as the log states it, or with the
+    length that `quantities` has), `dimension` (2 on a table, 3 in space, else null), `place_m` (where the grippers are
     on average, in the world of the effects' places; null in space), `sentence`, `baselines`, `leftover_p`, `caveats`,
     `seconds`, `quantities` (by name, like an effect's parameters), `posterior` (fields of `EffectValues`), `under_laws`
     (fields of `UnderLaw`), `undecided` and `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`, and
@@ -229,12 +229,13 @@ def _effect(effect: NamedEffect) -> dict[str, Any]:
 def _gap(gap: Gap, *, blamed: bool) -> dict[str, Any]:
     metres = gap.unit == "m"
     if not blamed:  # what explains best is not added to the simulator
-        unexplained = (gap.split["unexplained"] or 0.0) + (gap.split["named"] or 0.0)
+        unexplained = sum(gap.split[part] or 0.0 for part in ("named", "learnable", "unexplained"))
         gap = dataclasses.replace(
             gap,
             after_rmse_mm=gap.before_rmse_mm,
             horizons_mm={seconds: (before, before) for seconds, (before, _) in gap.horizons_mm.items()},
-            split=gap.split | {"named": 0.0, "unexplained": unexplained},
+            ahead_mm=gap.ahead_mm and gap.ahead_mm | {"named": gap.ahead_mm["nominal"]},
+            split=gap.split | {"named": 0.0, "learnable": None, "unexplained": unexplained},
         )
     sizes = {"before_rmse": gap.before_rmse_mm, "noise_floor": gap.noise_floor_mm, "after_rmse": gap.after_rmse_mm}
     return {
@@ -248,12 +249,8 @@ def _gap(gap: Gap, *, blamed: bool) -> dict[str, Any]:
         "held_out_episodes": gap.held_out_episodes,
         "ahead_mm": gap.ahead_mm,
         "horizons": [
-            {
-                "horizon_s": seconds,
-                "before_rmse_mm": before if metres else None,
-                "after_rmse_mm": after if metres else None,
-            }
-            for seconds, (before, after) in sorted(gap.horizons_mm.items())
+            {"horizon_s": seconds, "before_rmse_mm": b if metres else None, "after_rmse_mm": a if metres else None}
+            for seconds, (b, a) in sorted(gap.horizons_mm.items())
         ],
         "split": gap.split,
     }

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from cablejax.limits import make_hashable
+
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
@@ -92,6 +94,7 @@ class Effect:
     repeatable: bool = False
 
     def __post_init__(self):
+        make_hashable(self, "parameters", "null", "variants")
         names = [parameter.name for parameter in self.parameters]
         if not self.name or len(set(names)) < len(names):
             raise ValueError(f"Effect {self.name!r} has the parameters {names}, expected a name, and every one once.")

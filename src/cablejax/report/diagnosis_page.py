@@ -46,6 +46,7 @@ _BADGES: dict[Verdict, tuple[str, str]] = {
     "unknown": ("unknown", "Cause unknown"),
 }
 INFORMING = {
+    # which models: the words for all of them are the shortest
     **dict.fromkeys(
         ("stiffness_profile", "intrinsic_curvature", "gripper_rotation_offset", "gripper_compliance"), "a model"
     ),
@@ -130,7 +131,6 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         pictures=inline,
         orbit=orbit,
         trainable=addable and simulated.isdisjoint(OUTSIDE) and cable_of_log(diagnosis.log).marks is None,
-        # the words for every model are the shorter ones
         informs=min((INFORMING[name] for name in named & INFORMING.keys()), key=len, default="") if addable else "",
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
         where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,
@@ -195,7 +195,8 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
         where = " in a calm motion" if gap.before_rmse_mm > least else ""
         yield ("Cause", "none needed", f"a gap of {millimetres(least)} would have shown{where}")
     else:
-        best = max(diagnosis.ranking, key=lambda r: (r.probability or 0.0, r.held_out_shrinkage), default=None)
+        tried = [r for r in diagnosis.ranking if np.isfinite(r.held_out_shrinkage)]
+        best = max(tried, key=lambda r: (r.probability or 0.0, r.held_out_shrinkage), default=None)
         enough = "but the log shows too little of it" if diagnosis.undecided else "which is not enough"
         note = "" if best is None else f"closest: {effect_title(best.name)}, {enough}"
         yield ("Cause", "unknown", note)
