@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.cable_file import read_cable
 from cablejax.cli import main
 from cablejax.commands.simulate import _clear
 from cablejax.dataset.bucket import Bucket, UnreachableError, place_of
@@ -194,11 +195,16 @@ def test_reading_over_a_cut_connection_says_so_and_damages_nothing(wire):
     assert open_store("s3://cables/read").info() == info
 
 
-def test_commands_take_buckets(wire, capsys):
+def test_commands_take_buckets(wire, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     small = ["simulate", "--out", "s3://cables/cli.zarr", "--trajectories", "4", "--steps", "24", "--links", "5"]
     assert main([*small, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["path"] == "s3://cables/cli.zarr" and result["complete"] == 4
+    assert main(["view", "s3://cables/cli.zarr"]) == 0 and (tmp_path / "cli.html").is_file()
+    assert main(["cable", "--from", "s3://cables/cli.zarr", "--out", "cable.toml"]) == 0
+    assert read_cable(tmp_path / "cable.toml") == Cable()
+    capsys.readouterr()
     wire.cut()
     assert main(small) == 2
     assert "s3://cables/cli.zarr cannot be reached" in capsys.readouterr().err

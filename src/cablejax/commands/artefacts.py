@@ -47,7 +47,11 @@ def kind_of(source: str | pathlib.Path) -> tuple[Kind, pathlib.Path]:
         UsageError: it is none of this package's files; says what it is, what was expected and what to do.
         FileNotFoundError: there is no such file or folder.
     """
+    from cablejax.dataset.bucket import Bucket, place_of
+
     path = pathlib.Path(source)
+    if isinstance(place_of(source), Bucket):  # which holds data sets only
+        return "store", path
     if path.is_dir():
         for names, kind in _FOLDERS:
             if all((path / name).is_file() for name in names):

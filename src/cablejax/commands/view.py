@@ -25,9 +25,9 @@ class View(Command):
     content. Runs and diagnoses already have a page; the others get one.
 
     Attributes:
-        artefact: The file or folder, or a released model by name.
-        out: The page to write, an .html file. By default next to the file, with its name; a run's page stays where it
-            is.
+        artefact: The file or folder, a place in object storage (s3://BUCKET/PREFIX), or a released model by name.
+        out: The page to write, an .html file. By default next to the file, with its name, or here where that is in
+            object storage; a run's page stays where it is.
         overwrite: Replace a page that is there.
         browser: Also open the page in this machine's web browser.
     """
@@ -67,7 +67,8 @@ class View(Command):
         if kind == "run":
             return path / PAGE
         named = path.resolve() if path.name in ("", "..") else path
-        return named.with_name(f"{named.stem}.html")
+        page = named.with_name(f"{named.stem}.html")
+        return page if path.exists() else pathlib.Path(page.name)
 
 
 def sheet_of(kind: Kind, path: pathlib.Path) -> Sheet:
