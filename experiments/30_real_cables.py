@@ -54,10 +54,12 @@ def main() -> None:
     read, repairs, refused = _read(arguments.data)
     published = read_published(arguments.published)
 
-    def scored(cable: str, _: str):
+    def scored(cable: str, digest: str):
+        state = arguments.cache / digest
+        state.mkdir(parents=True, exist_ok=True)
         score = score_cable(
             read[cable],
-            state=arguments.cache,
+            state=state,
             progress=lambda text: print(f"{cable}: {text}", file=sys.stderr, flush=True),
         )
         return dataclasses.asdict(score)

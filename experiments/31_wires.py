@@ -107,7 +107,8 @@ def ranking(results: dict[str, dict[str, Any]]) -> str:
     rows = [["wire", *(f"`{name}`" for name in names)]]
     for name, result in results.items():
         ranked = {entry["name"]: entry for entry in result["verdict"]["ranking"]}
-        shares = (f"{ranked[n]['probability']:.2f}, {ranked[n]['held_out_shrinkage']:.2f}" for n in names)
+        tried = ((ranked[n]["probability"], ranked[n]["held_out_shrinkage"]) for n in names)
+        shares = (f"{chance:.2f}, {'not fitted' if share is None else f'{share:.2f}'}" for chance, share in tried)
         rows.append([name, *shares])
     return "\n".join(markdown_table(rows))
 

@@ -511,6 +511,18 @@ def test_the_search_sees_windows_of_both_halves():
     assert first[0] and first[_searched(dataclasses.replace(many, valid=valid), first)].sum() == 1
 
 
+def test_grippers_that_move_in_a_pause_are_refused():
+    log, late = cases.recording(), np.zeros(cases.SAMPLES)
+    late[60:] = 1.5
+    paused = dataclasses.replace(log, time=log.time + late)
+    still = dataclasses.replace(paused, gripper_pose=log.gripper_pose[:, :1].repeat(cases.SAMPLES, axis=1))
+    assert "resampled" in on_one_clock(still)[1][0]
+    pose = np.where(np.arange(cases.SAMPLES)[:, None] < 60, 0.0, [0.05, *np.zeros(6)])
+    moved = dataclasses.replace(still, gripper_pose=still.gripper_pose + pose[:, None].astype(np.float32))
+    with pytest.raises(ValueError, match=r"Episode 0 has no samples for 1\.5 s after 1\.18 s, where .* by 50 mm"):
+        on_one_clock(moved)
+
+
 def test_a_recording_at_another_rate_is_sampled_again():
     """By 4 %: no jitter, or one clock would play it too fast."""
     log = cases.recording()

@@ -13,7 +13,7 @@ from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.diagnose import with_roll
 from cablejax.spatial.gap import in_log
-from cablejax.spatial.grips import frames_of, held_keypoints
+from cablejax.spatial.grips import clamps, frames_of, held_keypoints
 from cablejax.spatial.identify import EDGES, layout_of
 from cablejax.spatial.windows import windows_of
 
@@ -45,6 +45,22 @@ def bending(spacing: float, leaves_at: float, count: int = 9):
 def test_keypoints_that_bend_with_the_cable_are_not_held(spacing, held):
     """However near to a gripper: a cable is moved across by less than 3 mm there whether or not it is held."""
     assert held_keypoints(*bending(spacing, (held - 1) * spacing)) == (held, held)
+
+
+def test_a_gripper_that_hides_its_marker_does_not_make_the_clamp_jump():
+    """The pose is that of a point 12 mm behind the marker, as a robot's tool centre may be."""
+    points, position, tangent, _, s = bending(0.1, 0.0)
+    place = position + 0.2 * np.sin(np.linspace(0.0, 9.0, SAMPLES))[:, None, None]
+    points = points + (place - position)[:, :, :1]
+    behind = place - 0.012 * np.array([1.0, -1.0])[:, None] * tangent
+    hidden = points.copy()
+    hidden[0, [*range(7), 100, 200, 201, 202], 0] = np.nan
+    clamp = clamps(hidden, behind, tangent, s, (1, 1))
+    np.testing.assert_allclose(clamp, clamps(points, behind, tangent, s, (1, 1)), atol=2e-3)
+    # in an episode that never shows it, the marker is as far from the pose as in the others
+    every = np.concatenate([hidden, np.full_like(hidden, np.nan)])
+    twice = [np.concatenate([part, part]) for part in (behind, tangent)]
+    np.testing.assert_allclose(clamps(every, *twice, s, (1, 1))[1], place[0], atol=1e-3)
 
 
 def rolling(log):

@@ -29,7 +29,7 @@ class Diagnose(Command):
 
     Attributes:
         logs: The recorded run, an .npz file. Several of one set-up are diagnosed together, in the order in which they
-            were recorded, and the verdict says what each one added.
+            were recorded, and on a table the verdict says what each one added.
         out: Folder of the report.
         commissioning: Logs of the same set-up without any effect: they separate the simulator's own error from the gap.
             For planar logs only.

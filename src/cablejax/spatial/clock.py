@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from cablejax.diagnose.clock import even_times, keypoints_at
 from cablejax.diagnose.log_faults import clock_offset
@@ -16,6 +17,8 @@ from cablejax.types import GapLog
 _EVEN = 0.05
 # if the mean interval of each episode is within this: a jitter is none in the mean, another rate is.
 _SAME_RATE = 0.003
+# A pause so long in which a gripper moves so far leaves open how [s, m].
+_PAUSE, _MOVED = 0.1, 5e-3
 # Samples a second that are enough [Hz]; twice as many are averaged.
 _RATE = 75.0
 
@@ -67,6 +70,9 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
 
     Positions and tangents of the grippers are linear between samples, as under the twists that were held; keypoints are
     those of `diagnose.clock.keypoints_at`.
+
+    Raises:
+        ValueError: the grippers move while there are no samples for longer than that is right.
     """
     steps = log.intervals
     if not len(steps):
@@ -77,8 +83,9 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     if same and np.abs(steps - interval).max() <= _EVEN * interval:
         return thinned(log)
     episodes = []
-    for one in episodes_of(log):
+    for number, one in enumerate(episodes_of(log)):
         time = one.time - one.time[0]
+        _require_motion_known(number, time, one.gripper_pose, interval)
         grid, before, after = even_times(time, interval)
         points = one.keypoints.astype(float)
         if len(time) > 1:
@@ -99,6 +106,23 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     )
     log, fewer = thinned(stack_episodes(episodes, log.meta, holds=log.hold is not None))
     return log, (report, *fewer)
+
+
+def _require_motion_known(
+    episode: int, time: Float[np.ndarray, "T"], pose: Float[np.ndarray, "T 2 7"], interval: float
+) -> None:
+    """Raises ValueError where grippers move in a pause: a straight line between two poses is not how they moved."""
+    steps = np.diff(time)
+    if not len(steps):
+        return
+    moved = np.linalg.norm(np.diff(pose[..., :3], axis=0), axis=-1).max(axis=1)
+    pauses = np.flatnonzero((steps > max(_PAUSE, 1.7 * interval, 1.7 * float(np.median(steps)))) & (moved > _MOVED))
+    if len(pauses):
+        k = int(pauses[0])
+        raise ValueError(
+            f"Episode {episode} has no samples for {steps[k]:.2g} s after {time[k]:.3g} s, where a gripper moves by "
+            f"{1e3 * moved[k]:.0f} mm, and how is not known. Write what is before and after as two episodes."
+        )
 
 
 def with_poses_in_time(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:

@@ -83,7 +83,7 @@ def diagnose_space(
     says = judge(found, density)
     counted, after = windows.chosen(says.use), says.after[says.use]
     cut = _seconds(says.compared.windows) if says.compared.windows.valid.sum() < counted.valid.sum() else None
-    sentence = verdict_sentence(says.verdict, says.effects, says.equivalent, says.share)
+    sentence = verdict_sentence(says.verdict, says.effects, says.equivalent, says.gap.shrinkage or 0.0)
     if says.hidden is not None:
         sentence = hidden_sentence(says.hidden)
     offset = ParameterEstimate(constant_offset(after, counted), None, "m")
@@ -108,7 +108,7 @@ def diagnose_space(
         ),
         log=log,
         nominal=nominal,
-        explained=explained,
+        explained=None if says.verdict == "none" else explained,
         noise_mm=np.full(windows.n_keypoints, 1e3 * noise),
         noise_correlation=np.zeros(0),
         seconds=time.perf_counter() - begun,

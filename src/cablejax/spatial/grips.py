@@ -83,5 +83,24 @@ def clamps(
     # the innermost held keypoint is where the cable leaves the gripper: it is observed, so it is what moves the clamp
     for q, k in enumerate((held[0] - 1, len(s) - held[1])):
         if held[q]:
-            clamp[:, :, q] = np.where(np.isfinite(points[:, :, k]), points[:, :, k], clamp[:, :, q])
+            seen = np.asarray(np.isfinite(points[:, :, k]).all(axis=-1))
+            off = np.where(seen[..., None], points[:, :, k] - clamp[:, :, q], 0.0)
+            unseen = clamp[:, :, q] + _filled(off, seen, tangent[:, :, q])
+            clamp[:, :, q] = np.where(seen[..., None], points[:, :, k], unseen)
     return clamp
+
+
+def _filled(
+    off: Float[np.ndarray, "E T 3"], seen: Bool[np.ndarray, "E T"], tangent: Float[np.ndarray, "E T 3"]
+) -> Float[np.ndarray, "E T 3"]:
+    """What a held keypoint is off its gripper's pose by, also where it is not seen: a clamp must not jump.
+
+    It is interpolated; in an episode that never shows it, it lies along the gripper's axis, as far as usual.
+    """
+    along = np.sum(off * tangent, axis=-1)[seen]
+    filled = (np.median(along) if len(along) else 0.0) * tangent
+    for e in np.flatnonzero(seen.any(axis=1)):
+        there = np.flatnonzero(seen[e])
+        for axis in range(3):
+            filled[e, :, axis] = np.interp(np.arange(len(seen[e])), there, off[e, there, axis])
+    return filled

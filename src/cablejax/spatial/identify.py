@@ -112,7 +112,7 @@ class Identified:
         And how the simulation of each ended: a `RodResult`.
 
         Args:
-            effects: that are simulated, with their values from the fit of all; None = all.
+            effects: that are simulated, with their values from that half's fit of all effects; None = all.
         """
         ones = (half.explanation if effects is None else half.with_only(effects) for half in self.halves)
         return self.unseen_by(*ones)

@@ -34,13 +34,13 @@ class Judgement:
         verdict: see `judged`.
         effects: that are named: those that the estimates show, where they lessen the gap; else none.
         equivalent: names that take each other's place equally well.
-        gap: before and after, in the windows that count.
+        gap: before and after these, in the windows that count.
         hidden: where the nominal cable amplifies noise too much to show a gap, although effects of the library lessen
             its error by more than that would: error before and with all of them together, as if it had no error by
             itself. The verdict is "unknown" then; else None.
-        share: of the squared gap that goes away: with the named effects, or of an unknown cause with all together.
-        before, after: motion of the nominal cable, and of that with what the estimates show [m].
-        results: how the latter's rollouts ended.
+        before, after: motion of the nominal cable, and of that with the named effects, or of an unknown cause with all
+            together [m].
+        results: how rollouts with what the estimates show ended.
         lost: windows that were not simulated.
         error: of the explained cable in each window [m].
         use: indices of the windows that count.
@@ -54,7 +54,6 @@ class Judgement:
     equivalent: tuple[tuple[str, ...], ...]
     gap: Gap
     hidden: Gap | None
-    share: float
     before: Float[np.ndarray, "W T F 3"]
     after: Float[np.ndarray, "W T F 3"]
     results: Int[np.ndarray, " W"]
@@ -89,9 +88,9 @@ def judge(found: Identified, density: float) -> Judgement:
     def together(least: float) -> Gap:
         return gap_of(before[use], found.unseen()[0][use], compared, noise, least)
 
-    share, hidden = gap.shrinkage, None
+    hidden = None
     if verdict == "unknown":  # each effect may be absent: by all of them together
-        share = together(smallest).shrinkage
+        gap, after = together(smallest), found.unseen()[0]
     elif verdict == "none" and any(step.accepted for step in found.steps[1:]):
         seen = together(smallest_gap(noise, windows))
         if seen.shrinkage_ci90 is not None and seen.shrinkage_ci90[0] > AVERAGED:
@@ -102,7 +101,6 @@ def judge(found: Identified, density: float) -> Judgement:
         equivalent=equivalent,
         gap=gap,
         hidden=hidden,
-        share=share or 0.0,
         before=before,
         after=after,
         results=results,
