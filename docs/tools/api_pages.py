@@ -12,7 +12,7 @@ EXPLAINED = {
     "bounded": "[Solvers](../concepts/solvers.md), [a solver of your own](../how_to/own_solver.md)",
     "cablejax": "[The pipeline](../concepts/index.md), [a cable of your own](../how_to/own_cable.md)",
     "commands": "[The command line](../command_line.md)",
-    "control": "[Control](../concepts/control.md), [the story in cells](../notebooks/01_shape_a_cable.md)",
+    "control": "[Control](../concepts/control.md), [shape a cable](../notebooks/01_shape_a_cable.md)",
     "dataset": "[Learn](../concepts/learn.md)",
     "diagnose": "[Diagnose](../concepts/diagnose.md), [a simulator of your own](../how_to/own_simulator.md)",
     "dynamics": "[Learn](../concepts/learn.md), [a dynamics model of your own](../how_to/own_dynamics_model.md)",
