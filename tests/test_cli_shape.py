@@ -117,7 +117,8 @@ def test_episodes_of_other_rates_are_played_where_one_time_step_fits(rates, mess
     write_gap_log(tmp_path / "motion.npz", log)
     play = ["shape", "--links", "8", "--out", str(tmp_path / "run"), "--motion", str(tmp_path / "motion.npz")]
     assert main(play) == (2 if message else 0)
-    assert re.search(message, capsys.readouterr().err)
+    said = capsys.readouterr().err
+    assert re.search(message, said) if message else "samples a second" not in said
     assert (tmp_path / "run").exists() is not bool(message)
 
 

@@ -501,6 +501,7 @@ def test_the_figure_has_keypoints_and_times_where_they_are():
     changed = dataclasses.replace(made, log=log, where=localise(log, made.nominal, np.full(POINTS, 1e-3)))
     figure = where_figure(changed)
     maps = [collection for ax in figure.axes for collection in ax.collections if hasattr(collection, "get_coordinates")]
+    assert len(maps) >= len(log.episode_length)
     for cells in maps[: len(log.episode_length)]:
         corners = cells.get_coordinates()
         time, along = corners[0, :, 0], corners[:, 0, 1]

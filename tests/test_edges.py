@@ -93,11 +93,8 @@ def original(name: str) -> pathlib.Path:
         stores.complete(open_or_create(folder, stores.SMALL))
     elif name == "bag":
         shutil.rmtree(folder)
-        poses = {
-            topic: (1000 + 0.01 * np.arange(40), np.tile([0, 0, 0, 1.0, 0, 0, 0], (40, 1)))
-            for topic in ("/left/pose", "/right/pose")
-        }
-        bags.write_bag(folder, swinging(40), poses, bags.StoragePlugin.MCAP)
+        points = swinging(80)
+        bags.write_bag(folder, points, bags.grippers_of(points), bags.StoragePlugin.MCAP)
     return folder
 
 
@@ -203,14 +200,14 @@ def import_deform(folder, edit):
 
 
 def import_pickle(folder, edit):
-    content = pickle.dumps(swinging(30).transpose(0, 2, 1))
+    content = pickle.dumps(swinging(60).transpose(0, 2, 1))
     (folder / "1.pkl").write_bytes(edges.edited_bytes(content, edit))
     return command("import", "deform", folder / "1.pkl", "--out", folder / "log.npz")
 
 
 def import_bag(folder, edit):
     shutil.copytree(original("bag"), folder / "bag")
-    file = sorted((folder / "bag").iterdir())[edit[0][1] % 2]
+    file = sorted((folder / "bag").iterdir())[edit[0][1] % 2 if edit else 0]
     file.write_bytes(edges.edited_bytes(file.read_bytes(), edit))
     (folder / "layout.toml").write_text(bags.LAYOUT)
     return answer(lambda: import_mcap(folder / "bag", folder / "layout.toml"))
@@ -230,7 +227,7 @@ def cloud_arrays(folder, edit):
 def cloud_folder(folder, edit):
     kind, changes = edit
     clouds.folder(folder, kind)
-    file = sorted(folder.iterdir())[changes[0][0] % 4]
+    file = sorted(folder.iterdir())[changes[0][0] % 4 if changes else 0]
     text = edges.edited_words(file.read_bytes().decode("latin1"), changes)
     file.write_bytes(text.encode("latin1", "replace"))
     return answer(lambda: seen(folder))
@@ -280,7 +277,10 @@ VERDICT = {
     "effects": [{"name": "bending_stiffness", "parameters": {"ratio": {"value": 2.0}}}],
     "posterior": [
         [{"name": "bending_stiffness", "parameters": {"ratio": 1.8}}],
-        [{"name": "table_friction", "parameters": {"ratio": 0.5}}, {"name": "viscous_drag", "parameters": {}}],
+        [
+            {"name": "table_friction", "parameters": {"coefficient": 0.5}},
+            {"name": "viscous_drag", "parameters": {"coefficient_n_s_per_m2": 2.0}},
+        ],
     ],
 }
 
@@ -310,7 +310,10 @@ def bounds_words(folder, edit):
 
 def motion_arrays(folder, edit):
     """Lays the cable out and plays the first command of each motion that is accepted."""
-    (folder / "motion.npz").write_bytes(edges.edited_archive(log_arrays(), edit))
+    arrays = log_arrays()
+    step = np.diff(arrays["gripper_pose"], axis=1) / np.diff(arrays["time"], axis=1)[..., None, None]
+    twist = np.concatenate([step, 0.0 * step[:, -1:]], axis=1).astype(np.float32)
+    (folder / "motion.npz").write_bytes(edges.edited_archive({**arrays, "gripper_command": twist}, edit))
     return command("shape", "--motion", folder / "motion.npz", "--links", "8", "--out", folder / "out")
 
 
@@ -409,9 +412,9 @@ OPTIONS = {
     "--cable --with --out --process-count --process-index --device",
     "train": "--lr --held-out --steps --batch --latent --message-passing --seed --start-from",
     "shape": "--steps --noise-mm --links --seed --target --weights --plant-effect --cable --solver",
-    "cable": "--from --out --seed",
+    "cable": "--from --out",
     "bench simulate": "--batch --seconds --rounds --threads --links",
-    "diagnose": "--out --commissioning --only --bounds --device --seed",
+    "diagnose": "--out --commissioning --only --bounds --device",
     "study": "--rounds --noise-mm --links --bounds --cable --plant-effect --out --seed",
     "view": "--out",
 }
@@ -481,6 +484,25 @@ EDGES = {
         options,
     ),
 }
+
+
+UNEDITED: dict[str, Any] = {
+    "csv": ((0, 1), []),
+    "cloud folder": ("ascii", []),
+    "store": (0, [], None),
+    "two logs": ([], []),
+    "view files": (1, []),
+    "exported": (0, []),
+}
+"""The edits that change nothing, where that is not an empty list of them."""
+SILENT = "weights", "robot lines", "kept", "options"
+"""Places that return nothing, or take no file."""
+
+
+@pytest.mark.parametrize("name", [name for name in EDGES if name not in SILENT])
+def test_what_is_not_damaged_is_accepted(name, tmp_path):
+    """Or nothing behind its first refusal would ever be tried."""
+    assert EDGES[name].attempt(tmp_path, UNEDITED.get(name, [])) is not None
 
 
 def fuzz(edge: Edge, inputs: int, folder: pathlib.Path) -> None:

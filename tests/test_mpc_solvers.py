@@ -137,7 +137,7 @@ def test_stays_finite_where_the_model_is_not(solver):
     """NaN for every motion: the guess comes back."""
     case = problem("U", rate=float("nan"))
     plan, _, _ = solve(solver, case, jnp.zeros((STEPS, 2, 3)))
-    assert np.isfinite(plan.motion).all()
+    np.testing.assert_array_equal(plan.motion, 0.0)
 
 
 @pytest.mark.slow
