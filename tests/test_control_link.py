@@ -460,7 +460,7 @@ def test_grippers_outside_that_move_alike_may_move_in_either_precision(given):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_commands_stay_within_all_limits(seed):
-    rng = np.random.default_rng(seed)
+    rng, kept = np.random.default_rng(seed), 0
     for _ in range(200):
         pose = np.concatenate([rng.uniform(-0.2, 0.2, (2, 2)), rng.uniform(-3, 3, (2, 1))], axis=1)
         pose[0, 0] -= 0.3
@@ -470,6 +470,11 @@ def test_commands_stay_within_all_limits(seed):
         for at in (middle, ended):
             assert 0.1 <= np.linalg.norm(at[1, :2] - at[0, :2]) <= 1.0
             assert (np.abs(at[:, :2]) <= [0.6, 0.2]).all()
+        inside = 0.11 <= np.linalg.norm(pose[1, :2] - pose[0, :2]) <= 0.99
+        if inside and (np.abs(pose[:, :2]) <= [0.59, 0.19]).all():
+            slow, along, kept = 1e-3 * rng.normal(size=(2, 3)), pose * [1.0, 1.0, 0.0], kept + 1
+            np.testing.assert_array_equal(LIMITS.shortened(slow, along, 1.2, 1.0), slow)
+    assert kept > 20
 
 
 @pytest.mark.parametrize(

@@ -221,25 +221,31 @@ def test_derivatives_are_those_of_finite_differences():
         marker_mass=0.01,
         twist_stiffness=0.03,
     )
-    leaves, tree = jax.tree.flatten(physics)
-    keys = jax.random.split(jax.random.key(0), len(leaves))
-    sizes = [1e-2 * jnp.maximum(jnp.abs(leaf).max(), 0.05) for leaf in leaves]
-    moved = [size * jax.random.normal(k, leaf.shape) for size, k, leaf in zip(sizes, keys, leaves, strict=True)]
-    direction = jax.tree.unflatten(tree, moved)
     rod = Rod(12)
 
-    def last(scale):
-        changed = jax.tree.map(lambda leaf, d: leaf + scale * d, physics, direction)
-        return rod.rollout(changed, position, frames, seen, _INTERVAL).points[::10]
+    def motion(physics):
+        return rod.rollout(physics, position, frames, seen, _INTERVAL).points[::10]
 
-    run = jax.jit(last, compiler_options=compiler_options())
-    _, derivative = jax.jit(lambda s: jax.jvp(last, (s,), (jnp.ones(()),)), compiler_options=compiler_options())(
-        jnp.zeros(())
-    )
-    step = 1e-4
-    difference = (run(step) - run(-step)) / (2 * step)
-    assert np.abs(difference).max() > 1e-4
-    np.testing.assert_allclose(derivative, difference, atol=2e-3 * float(np.abs(difference).max()))
+    run = jax.jit(motion, compiler_options=compiler_options())
+    slope = jax.jit(lambda d: jax.jvp(motion, (physics,), (d,))[1], compiler_options=compiler_options())
+    back = jax.jit(lambda w: jax.vjp(motion, physics)[1](w)[0], compiler_options=compiler_options())
+    rng = np.random.default_rng(0)
+    weight = jnp.asarray(rng.normal(size=run(physics).shape))
+    transposed = back(weight)
+    for field in dataclasses.fields(physics):
+        value = getattr(physics, field.name)
+        moved = 1e-2 * jnp.maximum(jnp.abs(value).max(), 0.05) * rng.normal(size=jnp.shape(value))
+        direction = dataclasses.replace(jax.tree.map(jnp.zeros_like, physics), **{field.name: moved})
+        derivative = slope(direction)
+        # far above what a time step leaves unsolved, 1e-9 m, and small for the motion
+        step = min(1e-5 / float(jnp.abs(derivative).max()), 0.1)
+        ahead, behind = (run(jax.tree.map(lambda x, d, k=k: x + k * d, physics, direction)) for k in (step, -step))
+        difference = (ahead - behind) / (2 * step)
+        largest = float(np.abs(difference).max())
+        assert largest > 1e-8, field.name
+        np.testing.assert_allclose(derivative, difference, atol=2e-3 * largest, rtol=0, err_msg=field.name)
+        forward, reverse = jnp.vdot(weight, derivative), jnp.vdot(getattr(transposed, field.name), moved)
+        np.testing.assert_allclose(reverse, forward, rtol=1e-6, atol=1e-6 * largest, err_msg=field.name)
 
 
 @pytest.mark.parametrize("twisting", [False, pytest.param(True, marks=pytest.mark.slow)])
