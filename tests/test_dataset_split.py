@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from typing import Any
 
 import jax
 import numpy as np
@@ -91,7 +92,8 @@ def test_what_is_held_out_but_moves_like_what_is_trained_on_is_said(tmp_path):
     assert known_motions([few, open_or_create(tmp_path / "b", dataclasses.replace(softer, seed=5))], [1, 2]) == []
     # those of the model to start from
     before = {"name": "free", "config": config_to_json(softer), "held_out": 2}
-    (said,) = known_motions([few], [1], [before, {**before, "config": {"schema": "of a version that nobody knows"}}])
+    unknown: list[Any] = [{**before, "config": {"schema": "of a version that nobody knows"}}, {}, "free", None]
+    (said,) = known_motions([few], [1], [before, *unknown])
     assert "trained on in free, of the model to start from" in said
     assert known_motions([few], [1], [{**before, "held_out": 5}]) == []
 
@@ -106,6 +108,13 @@ def test_a_conditioned_model_to_start_from_may_still_believe_the_cables_that_it_
         more.limits, np.stack([np.minimum(low, known[:, 0]), np.maximum(high, known[:, 1])], 1)
     )
     assert inputs_of_training([store], 0.3, "gns-reference").limits == own.limits
+    # of its own cables, whatever these are
+    stiffer = dataclasses.replace(CONFIG.cable, bending_stiffness=20 * CONFIG.cable.bending_stiffness)
+    other = filled(
+        tmp_path / "b", dataclasses.replace(CONFIG, discretisation=Discretisation(stiffer, n_links=5, timestep=1e-3))
+    )
+    (softest, _), _ = inputs_of_training([other], 0.3, "gns-conditioned").limits
+    assert softest == known[0, 0]
 
 
 def test_stores_that_do_not_belong_together_are_refused(tmp_path):

@@ -289,6 +289,12 @@ def test_a_mounted_folder_that_a_kill_left_half_described_is_filled(tmp_path, mo
     assert tree(path) == tree(tmp_path / "other")
 
 
+def test_a_folder_of_other_data_sets_is_not_filled(tmp_path):
+    open_or_create(tmp_path / "runs" / "a", SMALL)
+    with pytest.raises(ValueError, match="holds files other than a data set"):
+        open_or_create(tmp_path / "runs", SMALL)
+
+
 def test_altered_or_damaged_configuration_is_noticed(tmp_path):
     path = tmp_path / "data"
     open_or_create(path, SMALL)

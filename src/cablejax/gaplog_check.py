@@ -160,7 +160,7 @@ def _validate_meta(log: GapLog) -> None:
         if name not in meta:
             raise ValueError(f"Field 'meta.{name}' is missing.")
     points, grippers = log.keypoints.shape[2], log.gripper_pose.shape[2]
-    _check_cable(meta, points)
+    _check_cable(meta, points, in_space=log.keypoints.shape[3] == 3)
     for name, length in (("gravity_m_per_s2", 3), ("keypoint_arclength_m", points)):
         value = meta[name]
         if not isinstance(value, list) or len(value) != length or not all(v in LIMITS["finite"] for v in value):
@@ -190,7 +190,7 @@ def _validate_meta(log: GapLog) -> None:
         raise ValueError(f"Field 'meta.source' is {shown(meta['source'])}, expected text.")
 
 
-def _check_cable(meta: dict[str, Any], points: int) -> None:
+def _check_cable(meta: dict[str, Any], points: int, *, in_space: bool) -> None:
     """Raises unless the cable and its table could exist."""
     cable, table = meta["cable"], {_FRICTION: 0.0} if meta["table"] is None else meta["table"]
     for name, value in (("cable", cable), ("table", table)):
@@ -198,11 +198,8 @@ def _check_cable(meta: dict[str, Any], points: int) -> None:
             raise ValueError(f"Field 'meta.{name}' is {shown(value)}, expected an object.")
     if strangers := [key for key in table if key in NUMBERS and key != _FRICTION]:
         raise ValueError(f"Field 'meta.table' has {', '.join(strangers)}, which belongs into 'meta.cable'.")
-    if meta["table"] is None and cable.get(_FRICTION):
-        raise ValueError(
-            f"Field 'meta.cable' has {_FRICTION}, and 'meta.table' is null, as of a cable that hangs: the friction of "
-            "a table belongs into 'meta.table'."
-        )
+    if not in_space and meta["table"] is None and cable.get(_FRICTION):
+        raise ValueError(f"Field 'meta.cable' has {_FRICTION}, which belongs into 'meta.table', and that is null.")
     known = {key: value for key, value in cable.items() if key in NUMBERS and key != _FRICTION}
     lacking = {key: LIMITS[name].unit for key, (name, _) in NUMBERS.items() if key not in {**known, _FRICTION: None}}
     for key in cable:

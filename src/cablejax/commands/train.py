@@ -103,7 +103,7 @@ class Train(SeededCommand):
         initial = None if start is None else starting_from(start, config.model)
         training, held_out = read_split(stores, self.held_out, buffer=self.buffer, seed=self.seed)
         inputs = inputs_of_training(stores, self.held_out, start) if self.conditioned else None
-        if inputs is not None and all(low == high for low, high in inputs.limits):
+        if inputs and all(low == high for low, high in inputs_of_training(stores, self.held_out).limits):
             say(
                 "All cables of the data are equally stiff and rough, so a conditioned network learns nothing of its "
                 "inputs: simulate with --stiffness-range or --friction-range, or leave --conditioned out."
@@ -111,7 +111,7 @@ class Train(SeededCommand):
         counts = [len(part.gripper_twist) for part in held_out]
         total = sum(store.config.n_trajectories for store in stores) - sum(counts)
         say(f"{total} trajectories to train on, {sum(counts)} held out; {config.total_steps} steps")
-        for sentence in known_motions(stores, counts, [] if start is None else load_info(start).get("data", [])):
+        for sentence in known_motions(stores, counts, [] if start is None else load_info(start).get("data") or []):
             say(f"{sentence} Simulate with another --seed.")
         result = train(
             config, training, self.out, validation=concatenate(held_out), initial=initial, overwrite=self.overwrite

@@ -18,7 +18,7 @@ from cablejax.dataset.schema import config_from_json
 from cablejax.dataset.split import split
 from cablejax.dataset.store import Store
 from cablejax.dataset.windows import known_of_cables
-from cablejax.dynamics.weights import WeightsError, load_info, load_weights
+from cablejax.dynamics.weights import WeightsError, cable_of_weights, load_info, load_weights
 from cablejax.effects.given import GivenEffect, with_effects
 from cablejax.effects.physics import mean_resistance, nominal_physics
 from cablejax.types import cable_descriptor
@@ -93,7 +93,7 @@ def inputs_of_training(
     # the mean of equal numbers is rounded
     stiffness, friction = np.clip(known.mean(axis=0), low, high).tolist()
     if start_from is not None and load_weights(start_from)[0].conditioned:
-        before = np.array(inputs_of_weights(start_from, stores[0].config.cable).limits)
+        before = np.array(inputs_of_weights(start_from, cable_of_weights(start_from)).limits)
         low, high = np.minimum(low, before[:, 0]), np.maximum(high, before[:, 1])
     return CableInputs((stiffness, friction), tuple(zip(low.tolist(), high.tolist(), strict=True)))
 

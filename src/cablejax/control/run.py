@@ -132,7 +132,8 @@ def settling_time(times: Float[np.ndarray, " T"], error_cm: Float[np.ndarray, " 
     """First time from which on the error stays near its last value; infinite if it was still changing at the end.
 
     Near means within 10 % of the last value, and within 10 % of the error's change over the run where the target stayed
-    far; a thousandth of the cable's `length` [m] is near in any case. The last three samples must all be near.
+    far; a thousandth of `length` [m], of the cable or the target, is near in any case. The last three samples must all
+    be near.
     """
     error = np.asarray(error_cm)
     band = max(SETTLING_FRACTION * min(error[-1], abs(error[0] - error[-1])), 100 * SETTLING_FLOOR * length)

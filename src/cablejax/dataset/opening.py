@@ -175,8 +175,12 @@ def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None
         ValueError: the folder holds anything else.
     """
     path = path.resolve()
-    files = (file for file in path.rglob("*") if file.is_file() and not file.name.endswith(DRAFT))
-    if any(file.name != "zarr.json" or file.parent == path for file in files):
+    folders = [path / name for name in _arrays(config)]
+    own = {place / f"zarr.json{end}" for place in folders for end in ("", DRAFT)} | {
+        path / f"zarr.json{DRAFT}",
+        *folders,
+    }
+    if any(file not in own for file in path.rglob("*")):
         if (path / "zarr.json").is_file():  # another process was first
             return
         raise ValueError(

@@ -120,7 +120,7 @@ def known_motions(
     ]
     own = list(trained)
     for data in before:
-        with contextlib.suppress(ValueError):  # an earlier version's
+        with contextlib.suppress(ValueError, KeyError, TypeError):  # an earlier version's, or somebody's
             config = config_from_json(DatasetConfig, data["config"])
             trained.append(
                 (f"{data['name']}, of the model to start from", config, config.n_trajectories - data["held_out"])

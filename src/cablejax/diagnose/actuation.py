@@ -205,7 +205,7 @@ def actuation(
     _, exact = begun_at(pose[:, 0] + off)
     if exact.deviation < max(NEGLIGIBLE, _UNSURE * exact.noise):
         return exact
-    arms, nothing = begun_at(steadied(pose, expected, length)[0][:, 0])
+    arms, nothing = begun_at(steadied(pose, expected, np.where(known, length, 0))[0][:, 0])
     deviation = nothing.deviation
 
     lags = [[0.1, 0.05], [0.02, 0.2], [0.4, 0.2]]

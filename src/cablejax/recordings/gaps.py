@@ -39,6 +39,8 @@ times the noise of a coordinate."""
 
 # Repeated samples: so many in a row are a hold of the last value, if no more than this part of all steps are repeats.
 _HELD_SAMPLES, _HELD_PART = 3, 0.2
+# Steps after a hold by which it is told from a rest.
+_AFTER = 4
 # In so many of its steps a slower tracker repeats as often as usual, give or take one.
 _REGULAR = 0.9
 # Findings that an error lists.
@@ -164,7 +166,7 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
     """The take without the samples in which a tracker holds its last values.
 
     Rounded keypoints of a cable that rests repeat too: samples in which both grippers rest are kept, and without poses
-    those after which the cable has not moved on.
+    those after which the cable sets off instead of being somewhere else.
     """
     one, other, hidden = take.keypoints[1:], take.keypoints[:-1], np.isnan(take.keypoints)
     same = ((one == other) | (hidden[1:] & hidden[:-1])).all(axis=(1, 2)) & ~hidden[1:].all(axis=(1, 2))
@@ -181,8 +183,9 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
         return take
     repeated = np.zeros(len(take.time), bool)
     length = float(np.median(np.nansum(spacing(take.keypoints), axis=1)))
+    least = JUMP_NOISE * coordinate_noise([take.keypoints])
     for a, b in stretches(same):
-        if b - a >= _HELD_SAMPLES and _moves(take, a, b, MOVED * length):
+        if b - a >= _HELD_SAMPLES and _moves(take, a, b, MOVED * length, least):
             repeated[a + 1 : b + 1] = True
     if not repeated.any():
         return take
@@ -195,11 +198,23 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
     return take.part(~repeated)
 
 
-def _moves(take: Take, first: int, last: int, distance: float) -> bool:
-    """Whether a gripper moves by more than a distance [m] between two samples; without poses, the cable after them."""
+def _moves(take: Take, first: int, last: int, distance: float, least: float) -> bool:
+    """Whether a gripper moves by more than a distance [m] between two samples; without poses, see `_catches_up`."""
     if take.gripper_pose is None:
-        return float(median_step(take.keypoints[last : last + 2]).max(initial=0.0)) > distance
+        return _catches_up(take.keypoints[last:], least)
     return gripper_motion(take.gripper_pose[first : last + 1], take.keypoints.shape[2]) > distance
+
+
+def _catches_up(points: Float[np.ndarray, "S N D"], least: float) -> bool:
+    """Whether the first step is larger than this [m] and than those after it, or nothing tells that it is not.
+
+    A cable that sets off from a rest has neither.
+    """
+    seen = np.asarray(np.isfinite(points).all(axis=2))
+    step = median_step(points[seen.any(axis=1)][: _AFTER + 1])
+    if len(step) < _AFTER:
+        return True
+    return not step[0] <= max(least, JUMP_RATIO * float(step[1:].max()))
 
 
 def _slower(same: Bool[np.ndarray, " S"]) -> int:

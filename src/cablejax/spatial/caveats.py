@@ -59,8 +59,8 @@ def caveats(
             "The grippers' roll about the cable is not observed, or the roll in the log does not bring the nominal "
             "simulation closer to the recording. It is assumed to be the smallest rotation from their mean direction."
         ),
-        "All effects that were tried are fitted together. The gap after is the error with the named effects, at their "
-        "values from that fit, on recordings that no fit has seen.",
+        "All effects that were tried are fitted together. The gap after is the error with the named effects, of an "
+        "unknown cause that with all of them, at their values from that fit, on recordings that no fit has seen.",
     ]
     if "gripper_rotation_offset" in found.tried:
         fitted = found.everything.explanation.own

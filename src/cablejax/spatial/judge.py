@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -40,7 +41,7 @@ class Judgement:
             itself. The verdict is "unknown" then; else None.
         before, after: motion of the nominal cable, and of that with the named effects, or of an unknown cause with all
             together [m].
-        results: how rollouts with what the estimates show ended.
+        results: how the latter's rollouts ended.
         lost: windows that were not simulated.
         error: of the explained cable in each window [m].
         use: indices of the windows that count.
@@ -77,41 +78,51 @@ def judge(found: Identified, density: float) -> Judgement:
     noise, effects = windows.noise, named_effects(found, density)
     named = [effect.name for effect in effects]
     before, (after, results) = found.cable.motion(explanation()), found.unseen(with_both_drags(named))
-    lost, error, use = _simulated(after, windows)
-    compared, smallest, own = with_gap(found.cable.chosen(use), before[use], noise)
-    gap = gap_of(before[use], after[use], compared, noise, smallest)
+    measured = _measured(found, before, after)
+    gap, use, compared = (measured[name] for name in ("gap", "use", "compared"))
     equivalent = _equivalent(found, named)
     explaining = found.everything.with_only(with_both_drags(named))
     own_after = own_error(compared, explaining, compared.motion(explaining), noise)
     verdict = _verdict(gap, 1e3 * smallest_gap(noise, windows, own_after), named, equivalent)
 
-    def together(least: float) -> Gap:
-        return gap_of(before[use], found.unseen()[0][use], compared, noise, least)
-
     hidden = None
     if verdict == "unknown":  # each effect may be absent: by all of them together
-        gap, after = together(smallest), found.unseen()[0]
+        after, results = found.unseen()
+        measured = _measured(found, before, after)
     elif verdict == "none" and any(step.accepted for step in found.steps[1:]):
-        seen = together(smallest_gap(noise, windows))
+        seen = gap_of(before[use], found.unseen()[0][use], compared, noise, smallest_gap(noise, windows))
         if seen.shrinkage_ci90 is not None and seen.shrinkage_ci90[0] > AVERAGED:
             verdict, hidden = "unknown", seen
     return Judgement(
         verdict=verdict,
         effects=() if verdict in ("none", "unknown") else effects,
         equivalent=equivalent,
-        gap=gap,
         hidden=hidden,
         before=before,
         after=after,
         results=results,
-        lost=lost,
-        error=error,
-        use=use,
-        compared=compared,
-        smallest=smallest,
-        own=own,
         own_after=own_after,
+        **measured,
     )
+
+
+def _measured(
+    found: Identified, before: Float[np.ndarray, "W T F 3"], after: Float[np.ndarray, "W T F 3"]
+) -> dict[str, Any]:
+    """The fields of a `Judgement` that follow from the two motions."""
+    windows = found.cable.windows
+    lost, error, use = _simulated(after, windows)
+    compared, smallest, own = with_gap(found.cable.chosen(use), before[use], windows.noise)
+    gap = gap_of(before[use], after[use], compared, windows.noise, smallest)
+    return {
+        "lost": lost,
+        "error": error,
+        "use": use,
+        "compared": compared,
+        "smallest": smallest,
+        "own": own,
+        "gap": gap,
+    }
 
 
 def _simulated(after: Float[np.ndarray, "W T F 3"], windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
