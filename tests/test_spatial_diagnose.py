@@ -168,8 +168,28 @@ def test_grippers_that_rest_are_never_fast():
 )
 def test_a_gap_that_amplified_noise_hides_is_undecided(monkeypatch, better, accepted, verdict):
     """The nominal cable counts as off by itself by half a metre, so that no gap can be told from that."""
-    monkeypatch.setattr("cablejax.spatial.gap.own_error", lambda *arguments: 0.5)
-    monkeypatch.setattr("cablejax.spatial.judge.own_error", lambda *arguments: 0.5)
+    says, _ = judged_as(monkeypatch, better, accepted, own=0.5)
+    assert says.verdict == verdict and not says.effects and says.gap.shrinkage is None
+    if says.hidden is None:
+        assert verdict == "none"
+        return
+    assert says.hidden.shrinkage == pytest.approx(better, abs=0.02)
+    assert f"from {says.hidden.before_rmse_mm:.1f} to {says.hidden.after_rmse_mm:.1f} mm" in hidden_sentence(
+        says.hidden
+    )
+
+
+def test_the_gap_of_an_unknown_cause_is_that_of_all_effects_together(monkeypatch):
+    says, nearer = judged_as(monkeypatch, 0.6, True, own=1e-5)
+    assert says.verdict == "unknown" and not says.effects and says.hidden is None
+    assert says.gap.shrinkage == pytest.approx(0.6, abs=0.02)
+    np.testing.assert_array_equal(says.after, nearer)
+
+
+def judged_as(monkeypatch, better: float, accepted: bool, own: float):
+    """The judgement of a cable of which no effect is named and all together take a part of the squared error."""
+    monkeypatch.setattr("cablejax.spatial.gap.own_error", lambda *arguments: own)
+    monkeypatch.setattr("cablejax.spatial.judge.own_error", lambda *arguments: own)
     monkeypatch.setattr("cablejax.spatial.judge.named_effects", lambda found, density: ())
     windows = windows_of(cases.recording())
     cable = SpatialCable(Rod(8, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows)
@@ -185,15 +205,7 @@ def test_a_gap_that_amplified_noise_hides_is_undecided(monkeypatch, better, acce
         everything=types.SimpleNamespace(with_only=lambda names: explanation()),
         unseen=lambda names=None: (nearer if names is None else before, np.zeros(len(windows), int)),
     )
-    says = judge(found, 1.0)
-    assert says.verdict == verdict and not says.effects and says.gap.shrinkage is None
-    if says.hidden is None:
-        assert verdict == "none"
-        return
-    assert says.hidden.shrinkage == pytest.approx(better, abs=0.02)
-    assert f"from {says.hidden.before_rmse_mm:.1f} to {says.hidden.after_rmse_mm:.1f} mm" in hidden_sentence(
-        says.hidden
-    )
+    return judge(found, 1.0), nearer
 
 
 @pytest.mark.parametrize("better", ["", "stiffness_profile"])
