@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.control.cable_inputs import inputs_of_training, inputs_of_weights
+from cablejax.control.cable_inputs import inputs_of_data, inputs_of_weights
 from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.schema import Block, DatasetConfig, config_to_json
 from cablejax.dataset.split import known_motions, read_split, split
@@ -100,20 +100,21 @@ def test_what_is_held_out_but_moves_like_what_is_trained_on_is_said(tmp_path):
 
 def test_a_conditioned_model_to_start_from_may_still_believe_the_cables_that_it_knows(tmp_path):
     store = filled(tmp_path / "a", CONFIG)
-    own, more = (inputs_of_training([store], 0.3, start) for start in (None, "gns-conditioned"))
+    own = inputs_of_data([store], 0.3)
+    more = own.also_of("gns-conditioned")
     known = np.array(inputs_of_weights("gns-conditioned", CONFIG.cable).limits)
-    assert more.mean == own.mean == inputs_of_training([store], 0.3, "gns-reference").mean
+    assert more.mean == own.mean == own.also_of("gns-reference").mean
     low, high = np.array(own.limits).T
     np.testing.assert_array_equal(
         more.limits, np.stack([np.minimum(low, known[:, 0]), np.maximum(high, known[:, 1])], 1)
     )
-    assert inputs_of_training([store], 0.3, "gns-reference").limits == own.limits
+    assert own.also_of("gns-reference").limits == own.limits
     # of its own cables, whatever these are
     stiffer = dataclasses.replace(CONFIG.cable, bending_stiffness=20 * CONFIG.cable.bending_stiffness)
     other = filled(
         tmp_path / "b", dataclasses.replace(CONFIG, discretisation=Discretisation(stiffer, n_links=5, timestep=1e-3))
     )
-    (softest, _), _ = inputs_of_training([other], 0.3, "gns-conditioned").limits
+    (softest, _), _ = inputs_of_data([other], 0.3).also_of("gns-conditioned").limits
     assert softest == known[0, 0]
 
 

@@ -70,7 +70,7 @@ class Train(SeededCommand):
 
     def execute(self):
         """Trains, from a checkpoint where there is one, and reports the open-loop error."""
-        from cablejax.control.cable_inputs import inputs_of_training
+        from cablejax.control.cable_inputs import inputs_of_data
         from cablejax.dataset.opening import open_store
         from cablejax.dataset.split import known_motions, read_split
         from cablejax.dataset.windows import concatenate
@@ -102,12 +102,14 @@ class Train(SeededCommand):
         training_mesh(config)  # refuses a batch that the devices cannot share, before anything is read
         initial = None if start is None else starting_from(start, config.model)
         training, held_out = read_split(stores, self.held_out, buffer=self.buffer, seed=self.seed)
-        inputs = inputs_of_training(stores, self.held_out, start) if self.conditioned else None
-        if inputs and all(low == high for low, high in inputs_of_training(stores, self.held_out).limits):
+        inputs = inputs_of_data(stores, self.held_out) if self.conditioned else None
+        if inputs and all(low == high for low, high in inputs.limits):
             say(
                 "All cables of the data are equally stiff and rough, so a conditioned network learns nothing of its "
                 "inputs: simulate with --stiffness-range or --friction-range, or leave --conditioned out."
             )
+        if inputs and start is not None:
+            inputs = inputs.also_of(start)
         counts = [len(part.gripper_twist) for part in held_out]
         total = sum(store.config.n_trajectories for store in stores) - sum(counts)
         say(f"{total} trajectories to train on, {sum(counts)} held out; {config.total_steps} steps")

@@ -59,6 +59,18 @@ class CableInputs:
         within = np.clip(friction, *smoothest_to_roughest)
         return float(np.clip(stiffness - (friction - within), *softest_to_stiffest)), float(within)
 
+    def also_of(self, start_from: str | os.PathLike[str]) -> CableInputs:
+        """These inputs of a model that started from another one, see `load_weights`.
+
+        A conditioned one knows more cables: the limits include its own.
+        """
+        if not load_weights(start_from)[0].conditioned:
+            return self
+        known = inputs_of_weights(start_from, cable_of_weights(start_from))
+        pairs = zip(self.limits, known.limits, strict=True)
+        limits = tuple((min(low, least), max(high, most)) for (low, high), (least, most) in pairs)
+        return dataclasses.replace(self, limits=limits)
+
     def left_out(self, effects: Sequence[GivenEffect], cable: Cable) -> float:
         """Log ratio of stiffness to friction that effects make and the limits leave out of `with_effects`."""
         (stiffness, friction), within = self._asked(effects, cable), self.with_effects(effects, cable)
@@ -77,13 +89,8 @@ def inputs_of(effects: Sequence[GivenEffect], cable: Cable) -> np.ndarray:
     return np.asarray(cable_descriptor(*map(np.asarray, mean_resistance(physics))))
 
 
-def inputs_of_training(
-    stores: Sequence[Store], held_out: float, start_from: str | os.PathLike[str] | None = None
-) -> CableInputs:
-    """Of the trajectories of data sets that `dataset.split` leaves to train on.
-
-    A conditioned model to start from has learned more cables: the limits include its own.
-    """
+def inputs_of_data(stores: Sequence[Store], held_out: float) -> CableInputs:
+    """Of the trajectories of data sets that `dataset.split` leaves to train on."""
     parts = []
     for store in stores:
         rows, _ = split(store.config.n_trajectories, held_out)
@@ -92,9 +99,6 @@ def inputs_of_training(
     low, high = known.min(axis=0), known.max(axis=0)
     # the mean of equal numbers is rounded
     stiffness, friction = np.clip(known.mean(axis=0), low, high).tolist()
-    if start_from is not None and load_weights(start_from)[0].conditioned:
-        before = np.array(inputs_of_weights(start_from, cable_of_weights(start_from)).limits)
-        low, high = np.minimum(low, before[:, 0]), np.maximum(high, before[:, 1])
     return CableInputs((stiffness, friction), tuple(zip(low.tolist(), high.tolist(), strict=True)))
 
 

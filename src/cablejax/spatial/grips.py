@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cablejax.diagnose.log_faults import steadied
-from cablejax.poses import rotated
+from cablejax.poses import positions_at, rotated
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.types import GapLog
 
@@ -101,6 +101,5 @@ def _filled(
     filled = (np.median(along) if len(along) else 0.0) * tangent
     for e in np.flatnonzero(seen.any(axis=1)):
         there = np.flatnonzero(seen[e])
-        for axis in range(3):
-            filled[e, :, axis] = np.interp(np.arange(len(seen[e])), there, off[e, there, axis])
+        filled[e] = positions_at(np.arange(len(seen[e])), there, off[e, there])
     return filled
